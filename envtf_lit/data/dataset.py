@@ -1,0 +1,124 @@
+"""The offline dataset: aligned columns of transitions, grouped into episodes, validated once and immutable after."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from envtf_lit.errors import UserError
+
+COLUMNS = ("observations", "actions", "rewards", "next_observations", "terminated", "truncated")
+
+
+@dataclass(frozen=True, eq=False)
+class OfflineDataset:
+    """N transitions `(s, a, r, s')` with S observation and A action dimensions, stored episode after episode.
+
+    `next_observations` is stored, never guessed from the following row. `terminated` says that the task ended in s'
+    (no future reward), `truncated` that the log stopped there (the future is unknown, so bootstrap through it). Every
+    episode ends at a row where either is set, or at the last row.
+
+    Attributes:
+        observations: (N, S) float32.
+        actions: (N, A) float32.
+        rewards: (N,) float32.
+        next_observations: (N, S) float32.
+        terminated, truncated: (N,) bool.
+        episode_starts: (E,) int64, ascending, the first is 0.
+        task: the task's name, such as `hopper-medium-replay`, or None where no environment is known.
+        action_low, action_high: (A,) float32, the action space.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    next_observations: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    episode_starts: np.ndarray
+    action_low: np.ndarray
+    action_high: np.ndarray
+    task: str | None = field(default=None)
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    @property
+    def observation_dim(self) -> int:
+        return self.observations.shape[1]
+
+    @property
+    def action_dim(self) -> int:
+        return self.actions.shape[1]
+
+    @cached_property
+    def episode_ends(self) -> np.ndarray:
+        """(E,) one past the last row of each episode."""
+        return np.append(self.episode_starts[1:], len(self))
+
+    @cached_property
+    def episode_lengths(self) -> np.ndarray:
+        """(E,) rows of each episode."""
+        return self.episode_ends - self.episode_starts
+
+    @cached_property
+    def episode_returns(self) -> np.ndarray:
+        """(E,) undiscounted sum of rewards of each episode, summed in float64."""
+        return np.add.reduceat(self.rewards.astype(np.float64), self.episode_starts)
+
+    @cached_property
+    def episode_index(self) -> np.ndarray:
+        """(N,) the episode each row belongs to."""
+        return np.repeat(np.arange(len(self.episode_starts)), self.episode_lengths)
+
+    def select(self, episodes: Sequence[int] | np.ndarray) -> "OfflineDataset":
+        """The dataset of these episodes, in the order given."""
+        episodes = np.asarray(episodes, dtype=np.int64)
+        if len(episodes) == 0:
+            raise UserError("A dataset needs at least one episode: none was selected.")
+        lengths = self.episode_lengths[episodes]
+        starts = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+        rows = np.arange(lengths.sum()) + np.repeat(self.episode_starts[episodes] - starts, lengths)
+        columns = {name: getattr(self, name)[rows] for name in COLUMNS}
+        return OfflineDataset(
+            **columns,
+            episode_starts=starts,
+            action_low=self.action_low,
+            action_high=self.action_high,
+            task=self.task,
+        )
+
+    def split(self, held_out: float, *, seed: int) -> tuple["OfflineDataset", "OfflineDataset"]:
+        """Splits by whole episodes into (training, held-out); at least one episode lands on each side.
+
+        Args:
+            held_out: share of the episodes held out, in (0, 1).
+            seed: of the random permutation of the episodes.
+        """
+        count = len(self.episode_starts)
+        if count < 2:
+            raise UserError("The dataset has one episode and two are needed, to hold one out: collect more episodes.")
+        order = np.random.default_rng(seed).permutation(count)
+        number = min(max(1, round(held_out * count)), count - 1)
+        return self.select(np.sort(order[number:])), self.select(np.sort(order[:number]))
+
+    def returns_to_go(self, discount: float) -> np.ndarray:
+        """(N,) float32, `G_t = r_t + discount * G_{t+1}` to the end of the episode, where G is zero beyond the log.
+
+        For a truncated episode this is a lower-biased estimate when rewards are positive.
+        """
+        returns = np.zeros(len(self), dtype=np.float64)
+        longest = int(self.episode_lengths.max())
+        following = np.zeros(len(self.episode_starts))
+        for offset in range(longest):  # from each episode's last row backwards, all episodes at once
+            alive = np.flatnonzero(self.episode_lengths > offset)
+            rows = self.episode_ends[alive] - 1 - offset
+            following[alive] = self.rewards[rows] + discount * following[alive]
+            returns[rows] = following[alive]
+        return returns.astype(np.float32)
+
+
+def starts_from_ends(ends: np.ndarray) -> np.ndarray:
+    """(E,) episode starts from an (N,) boolean column that marks each episode's last row; the last row always ends."""
+    return np.concatenate([[0], np.flatnonzero(ends[:-1]) + 1]).astype(np.int64)

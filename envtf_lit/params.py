@@ -1,0 +1,227 @@
+"""Every option of every stage, with its default, unit and meaning: the schema of `params.yaml`."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+Precision = Literal["fp32", "bf16"]
+
+
+@dataclass(frozen=True)
+class DownloadOptions:
+    """Where the dataset comes from.
+
+    Attributes:
+        source: `zoo` lets the shipped behaviour policies act in MuJoCo; `file` reads a file of yours.
+        path: the HDF5 or NPZ file of `source: file`.
+        transitions: rows to collect from the zoo.
+    """
+
+    source: Literal["zoo", "file"] = "zoo"
+    path: str | None = None
+    transitions: int = 100_000
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """The Environment Transformer's architecture and objective.
+
+    Attributes:
+        layers: transformer blocks.
+        heads: attention heads; divides `width` into even parts.
+        width: embedding dimension.
+        context: tokens (steps) that attention reaches back, in training and in generation.
+        dropout: probability, in the residual branches.
+        activation: nonlinearity of the feed-forward layers.
+        objective: `beta_nll` (Seitzer et al. 2022), `nll`, or `paper_mse` (the paper's sampled mse, which drives every
+            variance to zero).
+        target: `delta` predicts the scaled change of the state, `absolute` the z-scored next state (the paper's form).
+    """
+
+    layers: int = 4
+    heads: int = 4
+    width: int = 128
+    context: int = 32
+    dropout: float = 0.0
+    activation: Literal["relu", "gelu"] = "gelu"
+    objective: Literal["beta_nll", "nll", "paper_mse"] = "beta_nll"
+    target: Literal["delta", "absolute"] = "delta"
+
+
+@dataclass(frozen=True)
+class TrainModelOptions:
+    """How the world model is trained.
+
+    Attributes:
+        model: architecture and objective.
+        updates: gradient steps in all.
+        updates_per_epoch: gradient steps between two validations (and resumable checkpoints).
+        batch_size: windows of `model.context` steps per gradient step.
+        learning_rate: peak, reached after `warmup` of the updates, then a cosine to zero.
+        warmup: share of the updates, in [0, 1).
+        weight_decay: AdamW's, on matrices only.
+        eps: AdamW's.
+        gradient_clip: largest gradient norm.
+        held_out: share of the episodes kept for validation.
+    """
+
+    model: ModelOptions = field(default_factory=ModelOptions)
+    updates: int = 6_000
+    updates_per_epoch: int = 1_000
+    batch_size: int = 32
+    learning_rate: float = 0.001
+    warmup: float = 0.05
+    weight_decay: float = 0.0001
+    eps: float = 0.00000001
+    gradient_clip: float = 1.0
+    held_out: float = 0.1
+
+
+@dataclass(frozen=True)
+class GenerateRolloutsOptions:
+    """The first imagined rollouts, under a clone of the behaviour policy.
+
+    Attributes:
+        clone_updates: gradient steps of the behaviour clone.
+        clone_batch_size: rows per gradient step of the clone.
+        branches: rollouts, each from a dataset state drawn at random.
+        horizon: steps of each rollout, unless the robot falls first.
+        history: real steps given to the model before the branch point, at most `context - 1`.
+        exploration: scale of the Gaussian noise added to the clone's sampled actions, in units of the action range's
+            half.
+        mode: `sample` draws each next state from the model, `mean` takes its mean.
+    """
+
+    clone_updates: int = 2_000
+    clone_batch_size: int = 512
+    branches: int = 20_000
+    horizon: int = 5
+    history: int = 4
+    exploration: float = 0.1
+    mode: Literal["mean", "sample"] = "sample"
+
+
+@dataclass(frozen=True)
+class ImaginationOptions:
+    """How imagined transitions enter policy learning.
+
+    Attributes:
+        real_ratio: share of real rows in each batch, in (0, 1].
+        refresh_every: updates between two rounds of new rollouts under the current policy; 0 keeps the stored ones
+            (the paper's fixed buffer).
+        branches: rollouts per round.
+        horizon: steps of each rollout, unless the robot falls first.
+        history: real steps given to the model before the branch point.
+        mode: `sample` draws each next state from the model, `mean` takes its mean.
+        buffer_size: imagined transitions kept; the oldest leave first.
+        penalty: weight of the uncertainty u, in units of the data's reward standard deviation: `r - weight * std * u`.
+        penalty_up_on: rows on which the conservative term pushes Q up: `real` (COMBO's form) or `mixture` (the
+            paper's equation 5 read literally, which rewards the policy's own imagined actions).
+    """
+
+    real_ratio: float = 0.5
+    refresh_every: int = 250
+    branches: int = 2_000
+    horizon: int = 5
+    history: int = 4
+    mode: Literal["mean", "sample"] = "sample"
+    buffer_size: int = 100_000
+    penalty: float = 0.0
+    penalty_up_on: Literal["real", "mixture"] = "real"
+
+
+@dataclass(frozen=True)
+class PolicyOptions:
+    """Conservative Q-Learning (Kumar et al. 2020) on data, or on data and imagination.
+
+    Attributes:
+        updates: gradient steps in all, the warm start included.
+        updates_per_epoch: gradient steps between two log lines (and resumable checkpoints).
+        updates_per_step: gradient steps per Lightning training step.
+        batch_size: rows per gradient step.
+        hidden: units of each hidden layer of actor and critics.
+        critics: Q-functions, of which the target takes the smallest.
+        layer_norm: LayerNorm in the critics.
+        discount: of future rewards, per step.
+        target_rate: share of the critics that enters the target networks at each update.
+        actor_learning_rate: Adam's.
+        critic_learning_rate: Adam's.
+        cql_weight: weight of the conservative term.
+        sampled_actions: actions of each kind (uniform, pi(s), pi(s')) in the log-sum-exp.
+        temperature: of the log-sum-exp.
+        warm_start: first updates, in which the critics fit Monte-Carlo returns and the actor clones the data.
+        warm_start_learning_rate: Adam's, of both, during the warm start.
+        imagination: None trains on data alone.
+    """
+
+    updates: int = 10_000
+    updates_per_epoch: int = 500
+    updates_per_step: int = 10
+    batch_size: int = 256
+    hidden: tuple[int, ...] = (256, 256)
+    critics: int = 2
+    layer_norm: bool = True
+    discount: float = 0.99
+    target_rate: float = 0.005
+    actor_learning_rate: float = 0.0001
+    critic_learning_rate: float = 0.0003
+    cql_weight: float = 5.0
+    sampled_actions: int = 4
+    temperature: float = 1.0
+    warm_start: int = 2_000
+    warm_start_learning_rate: float = 0.001
+    imagination: ImaginationOptions | None = None
+
+
+@dataclass(frozen=True)
+class TrainPolicyOptions:
+    """The two policies that are compared, with equal budgets.
+
+    Attributes:
+        cql: data alone.
+        et_cql: data and imagination.
+    """
+
+    cql: PolicyOptions = field(default_factory=PolicyOptions)
+    et_cql: PolicyOptions = field(default_factory=lambda: PolicyOptions(imagination=ImaginationOptions()))
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """The evidence.
+
+    Attributes:
+        episodes: MuJoCo episodes per policy, seeded `seed + 1000 + i`.
+        trajectories: held-out episodes on which the world model is scored over long horizons.
+        video_frames: frames of the real-versus-imagined video, at most 150.
+    """
+
+    episodes: int = 20
+    trajectories: int = 50
+    video_frames: int = 150
+
+
+@dataclass(frozen=True)
+class Params:
+    """All of `params.yaml`.
+
+    Attributes:
+        task: robot and tier, such as `hopper-medium-replay`.
+        seed: of everything random.
+        threads: CPU threads of each stage; part of what makes results equal to the bit.
+        precision: of matrix products in training and imagination; losses and optimisers stay in fp32.
+        download: the dataset.
+        train_model: the world model.
+        generate_rollouts: the behaviour clone and its imagined rollouts.
+        train_policy: the policies.
+        evaluate: the evidence.
+    """
+
+    task: str = "hopper-medium-replay"
+    seed: int = 0
+    threads: int = 2
+    precision: Precision = "bf16"
+    download: DownloadOptions = field(default_factory=DownloadOptions)
+    train_model: TrainModelOptions = field(default_factory=TrainModelOptions)
+    generate_rollouts: GenerateRolloutsOptions = field(default_factory=GenerateRolloutsOptions)
+    train_policy: TrainPolicyOptions = field(default_factory=TrainPolicyOptions)
+    evaluate: EvaluateOptions = field(default_factory=EvaluateOptions)

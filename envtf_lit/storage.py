@@ -1,0 +1,138 @@
+"""Files that are whole or absent, and modules on disk as safetensors beside JSON: nothing read here can run code."""
+
+import contextlib
+import errno
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from envtf_lit.errors import UserError, did_you_mean
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yields a temporary path beside `path`; on success it takes `path`'s place, on failure it is removed.
+
+    Works for a file and for a folder alike (the block creates whichever it wants).
+
+    Raises:
+        UserError: the disk is full or the place cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        if path.is_dir():
+            shutil.rmtree(path)
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise UserError(f"No space left while writing {path}: free some disk space and run again.") from error
+        if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
+            raise UserError(f"Cannot write {path}: {error.strerror}; choose a folder you may write to.") from error
+        raise
+    finally:
+        if temporary.is_dir():
+            shutil.rmtree(temporary)
+        else:
+            temporary.unlink(missing_ok=True)
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Writes finite numbers, strings, lists and dictionaries; NaN and infinity raise ValueError."""
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    with replacing(path) as temporary:
+        temporary.write_text(text)
+
+
+def read_json(path: str | Path) -> Any:
+    """Reads a JSON file.
+
+    Raises:
+        UserError: the file is missing or is not JSON.
+    """
+    path = Path(path)
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist: check the path, or run the stage that writes it.") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} is not valid JSON ({error}): write it anew.") from None
+
+
+def save_module(folder: str | Path, module: nn.Module, *, kind: str, arguments: Mapping[str, Any]) -> None:
+    """Writes `weights.safetensors` and `config.json` (the registry's `kind` and the constructor's `arguments`).
+
+    No metadata goes into the safetensors file: several keys are written in random order, and equal weights must give
+    equal bytes.
+    """
+    with replacing(folder) as temporary:
+        temporary.mkdir()
+        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in module.state_dict().items()}
+        save_file(tensors, temporary / "weights.safetensors")
+        write_json(temporary / "config.json", {"kind": kind, "arguments": dict(arguments)})
+
+
+def load_module(folder: str | Path, registry: Mapping[str, type[nn.Module]]) -> nn.Module:
+    """Rebuilds what `save_module` wrote, in eval mode on the CPU, through a closed registry of classes.
+
+    Raises:
+        UserError: no such folder, an unknown kind, arguments the class does not take, or weights that are damaged or
+            of another shape.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a model folder: it does not exist; run the stage that writes it.")
+    config = read_json(folder / "config.json")
+    kind = config.get("kind") if isinstance(config, dict) else None
+    if kind not in registry:
+        raise UserError(f"{folder}/config.json names the unknown kind {kind!r}: {did_you_mean(str(kind), registry)}")
+    try:
+        module = registry[kind](**config["arguments"])
+    except (TypeError, KeyError, ValueError) as error:
+        raise UserError(f"{folder}/config.json does not describe a {kind} ({error}): save the model anew.") from None
+    load_weights(module, folder / "weights.safetensors")
+    return module.eval()
+
+
+def load_weights(module: nn.Module, path: str | Path) -> None:
+    """Fills `module` from a safetensors file.
+
+    Raises:
+        UserError: the file is missing, damaged, or holds other names or shapes than the module.
+    """
+    path = Path(path)
+    try:
+        tensors = load_file(path)
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist: check the path, or run the stage that writes it.") from None
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"{path} is not a safetensors file ({error}): write it anew.") from None
+    expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
+    found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    if expected != found:
+        odd = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))[0]
+        raise UserError(
+            f"{path} does not fit the model: {odd} has shape {found.get(odd)} in the file and {expected.get(odd)} in "
+            "the model; use the configuration it was saved with."
+        )
+    module.load_state_dict(tensors)
+
+
+def pick_device() -> torch.device:
+    """The accelerator if there is one, else the CPU."""
+    if torch.accelerator.is_available():
+        accelerator = torch.accelerator.current_accelerator()
+        assert accelerator is not None
+        return accelerator
+    return torch.device("cpu")

@@ -1,0 +1,108 @@
+"""Robots and the twenty tasks: environment ids, termination rules, reference scores."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from envtf_lit.errors import UserError, did_you_mean
+
+TIERS = ("random", "medium", "medium-replay", "medium-expert", "full-replay")
+
+
+def _all_below(observation: Tensor, limit: float) -> Tensor:
+    return (observation.abs() < limit).all(-1)
+
+
+def hopper_terminated(observation: Tensor) -> Tensor:
+    """Hopper-v5's unhealthy test: height <= 0.7, |pitch| >= 0.2, or any later coordinate beyond 100 in size.
+
+    The copies of this rule in MOPO, RAMBO and their descendants apply the size test to a boolean, so that values
+    below -100 pass; here it is applied to the coordinates, as the simulator does.
+    """
+    height, pitch = observation[..., 0], observation[..., 1]
+    healthy = (height > 0.7) & (pitch.abs() < 0.2) & _all_below(observation[..., 1:], 100.0)
+    return ~healthy
+
+
+def walker2d_terminated(observation: Tensor) -> Tensor:
+    """Walker2d-v5's unhealthy test: height outside (0.8, 2.0) or |pitch| >= 1."""
+    height, pitch = observation[..., 0], observation[..., 1]
+    return ~((height > 0.8) & (height < 2.0) & (pitch.abs() < 1.0))
+
+
+def ant_terminated(observation: Tensor) -> Tensor:
+    """Ant-v5's unhealthy test: a non-finite state or a torso height outside [0.2, 1.0]."""
+    height = observation[..., 0]
+    return ~(torch.isfinite(observation).all(-1) & (height >= 0.2) & (height <= 1.0))
+
+
+def never_terminated(observation: Tensor) -> Tensor:
+    """HalfCheetah-v5 has no unhealthy state: episodes end by the time limit alone."""
+    return torch.zeros(observation.shape[:-1], dtype=torch.bool, device=observation.device)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A simulated robot and what is known of it without data.
+
+    `return_random` and `return_expert` are D4RL's reference returns, measured on the older -v2 environments; scores on
+    -v5 are therefore comparable among themselves, not with D4RL's tables.
+    """
+
+    name: str
+    env_id: str
+    observation_dim: int
+    action_dim: int
+    return_random: float
+    return_expert: float
+    terminated: Callable[[Tensor], Tensor]  # next observation (..., S) -> bool (...)
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    action_limit: float = 1.0  # actions lie in [-limit, limit]
+    max_episode_steps: int = 1000
+
+    def normalised_score(self, episode_return: float) -> float:
+        """D4RL's score: 0 is a random policy, 100 its expert. `100 (G - G_random) / (G_expert - G_random)`."""
+        return 100.0 * (episode_return - self.return_random) / (self.return_expert - self.return_random)
+
+
+ROBOTS = {
+    robot.name: robot
+    for robot in (
+        Robot("hopper", "Hopper-v5", 11, 3, -20.272305, 3234.3, hopper_terminated),
+        Robot("halfcheetah", "HalfCheetah-v5", 17, 6, -280.178953, 12135.0, never_terminated),
+        Robot("walker2d", "Walker2d-v5", 17, 6, 1.629008, 4592.3, walker2d_terminated),
+        # without the contact forces: the dimensions that are not constant zero in D4RL's Ant
+        Robot(
+            "ant", "Ant-v5", 27, 8, -325.6, 3879.7, ant_terminated, {"include_cfrc_ext_in_observation": False}
+        ),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """A robot and a tier of data, such as `hopper-medium-replay`."""
+
+    robot: Robot
+    tier: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.robot.name}-{self.tier}"
+
+
+TASKS = {task.name: task for task in (Task(robot, tier) for robot in ROBOTS.values() for tier in TIERS)}
+
+
+def get_task(name: str) -> Task:
+    """The task of that name.
+
+    Raises:
+        UserError: the name is none of the twenty; the message holds the nearest one.
+    """
+    if name not in TASKS:
+        raise UserError(f"Unknown task {name!r}: {did_you_mean(name, TASKS)}")
+    return TASKS[name]

@@ -1,0 +1,74 @@
+"""What every world model offers, whatever is inside: imagination, evaluation and planning see only this."""
+
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import torch
+from torch import Tensor
+
+Mode = Literal["mean", "sample"]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One imagined step for a batch of B rows, in the data's own units unless said otherwise.
+
+    Attributes:
+        observation: (B, S) next state.
+        reward: (B,).
+        mean: (B, S + 1) the predictive mean of (next observation, reward).
+        aleatoric: (B, S + 1) standard deviation of (next observation, reward) from the data's own noise.
+        epistemic: (B, S + 1) standard deviation from lack of data, or None where the model has no such estimate.
+        uncertainty: (B,) `||sqrt(S_au + S_eu)||_2 / sqrt(S)` over z-scored live observation dimensions: the penalty u.
+        log_prob: (B,) log-density of (observation, reward) under the predictive distribution.
+    """
+
+    observation: Tensor
+    reward: Tensor
+    mean: Tensor
+    aleatoric: Tensor
+    epistemic: Tensor | None
+    uncertainty: Tensor
+    log_prob: Tensor
+
+
+class WorldModel(Protocol):
+    """A batched, seeded simulator with an explicit state.
+
+    States are consumed: after `step` only the returned state is valid, since caches are written in place.
+    """
+
+    observation_dim: int
+    action_dim: int
+
+    def init(self, observations: Tensor, actions: Tensor, lengths: Tensor) -> Any:
+        """Starts B rollouts from histories.
+
+        Args:
+            observations: (B, T, S), right-padded; the last valid one has no action yet.
+            actions: (B, T - 1, A), right-padded.
+            lengths: (B,) number of valid observations of each row, 1 to T.
+        """
+        ...
+
+    def step(
+        self, state: Any, action: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None
+    ) -> tuple[Any, Prediction]:
+        """Acts with (B, A) in every row; the next observation is the mean, or a draw with `generator`."""
+        ...
+
+    def observe(self, state: Any, observation: Tensor) -> Any:
+        """Replaces the current observation (B, S) by what was really seen (teacher forcing, online use)."""
+        ...
+
+    def current(self, state: Any) -> Tensor:
+        """The current observation (B, S) of a state."""
+        ...
+
+    def fork(self, state: Any, n: int) -> Any:
+        """Each row n times, in order: row b becomes rows b*n … b*n + n - 1."""
+        ...
+
+    def gather(self, state: Any, index: Tensor) -> Any:
+        """The rows of these indices (K,), in the order given."""
+        ...
