@@ -1,0 +1,102 @@
+"""Open-loop and teacher-forced errors against a linear world whose errors are known."""
+
+import numpy as np
+import pytest
+import torch
+from analytic import linear_data, linear_world
+
+from envtf_lit.world_models.horizon import (
+    Scale,
+    forecast,
+    horizon_report,
+    nmse,
+    open_loop_error,
+    segments,
+    steps_within,
+    whole_episodes,
+)
+
+
+def test_a_perfect_model_is_censored_everywhere():
+    data = linear_data((30, 50, 12))
+    report = horizon_report(linear_world(), whole_episodes(data, 10, seed=0), Scale.of(data))
+    for steps in (*report.open_loop.values(), *report.teacher_forced.values()):
+        assert steps.censored == 1.0 and steps.mean == pytest.approx((30 + 50 + 12) / 3)
+    assert report.nmse_one_step < 1e-10 and report.explosion_rate == 0.0
+    assert list(report.median_nmse) == [1, 5, 10, 50]
+
+
+def by_hand(model, data, episode: int, *, feedback: bool) -> np.ndarray:
+    """nmse_h of one episode with plain numpy in float64."""
+    matrix, gain = model.matrix.double().numpy(), model.gain.double().numpy()
+    columns = np.column_stack([data.observations, data.rewards]).astype(float)
+    std = columns.std(0)[[0, 1, 3]]  # the third observation is constant and left out
+    begin, end = data.episode_starts[episode], data.episode_ends[episode]
+    state, errors = data.observations[begin].astype(float), []
+    for row in range(begin, end):
+        state = state if feedback else data.observations[row].astype(float)
+        reward, state = state.sum(), matrix @ state + gain @ data.actions[row]
+        truth = np.append(data.next_observations[row], data.rewards[row])
+        errors.append(np.mean(((np.append(state, reward) - truth)[[0, 1, 3]] / std) ** 2))
+    return np.array(errors)
+
+
+@pytest.mark.parametrize(("feedback", "name"), [(True, "imagined"), (False, "recorded")])
+def test_errors_equal_those_computed_by_hand(feedback, name):
+    data, model = linear_data((20, 35), noise=0.01), linear_world(error=0.03)
+    trajectories = whole_episodes(data, 2, seed=0)
+    error = nmse(forecast(model, trajectories, feedback=name).mean, trajectories, Scale.of(data))
+    for episode, length in enumerate((20, 35)):
+        expected = by_hand(model, data, episode, feedback=feedback)
+        np.testing.assert_allclose(error[episode, :length].numpy(), expected, rtol=2e-3, atol=1e-9)
+
+
+def test_open_loop_drifts_where_teacher_forcing_does_not():
+    data = linear_data((200, 200, 200))
+    report = horizon_report(linear_world(error=0.01), whole_episodes(data, 3, seed=0), Scale.of(data))
+    assert report.open_loop[0.01].mean < 60 and report.teacher_forced[0.01].mean == 200
+    assert report.open_loop[0.01].mean <= report.open_loop[0.1].mean
+    assert report.median_nmse[100] > 10 * report.median_nmse[5]
+
+
+def test_steps_within_counts_the_steps_before_the_first_error():
+    error = torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.5, 0.0], [0.01, 0.5, 0.5], [0.0, torch.inf, 0.0]])
+    steps, censored = steps_within(error, torch.tensor([3, 3, 3, 1, 3]), 0.01)
+    assert steps.tolist() == [0, 2, 1, 1, 1]  # the fourth ends after one step, exactly at the threshold
+    assert censored.tolist() == [False, False, False, True, False]
+
+
+def test_explosions_and_undefined_predictions_are_counted():
+    data, exploding, undefined = linear_data((40, 40)), linear_world(), linear_world()
+    exploding.matrix = 2.0 * exploding.matrix
+    undefined.matrix = torch.full((3, 3), torch.nan)
+    trajectories, scale = whole_episodes(data, 2, seed=0), Scale.of(data)
+    assert horizon_report(exploding, trajectories, scale).explosion_rate == 1.0
+    report = horizon_report(undefined, trajectories, scale)
+    assert report.explosion_rate == 1.0 and report.open_loop[0.1].mean == 0.0
+    assert open_loop_error(undefined, trajectories, scale) == pytest.approx(1e4)
+
+
+def test_selection_prefers_the_better_model_and_is_finite_for_all():
+    data = linear_data((60, 60, 60), noise=0.001)
+    batch, scale = segments(data, 64, 20, seed=0), Scale.of(data)
+    errors = [open_loop_error(linear_world(error), batch, scale) for error in (0.0, 0.01, 0.1, 1.0)]
+    assert errors == sorted(errors) and np.isfinite(errors).all()
+
+
+def test_segments_never_cross_an_episode():
+    data = linear_data((5, 30, 3))
+    batch = segments(data, 200, 8, seed=1)
+    last = batch.targets[:, :-1, :3]
+    same = torch.isclose(last, batch.observations[:, 1:]).all(-1)
+    assert bool((same | ~batch.valid[:, 1:]).all())
+    assert batch.lengths.min() == 1 and batch.lengths.max() == 8
+    assert torch.equal(batch.observations, segments(data, 200, 8, seed=1).observations)
+
+
+def test_whole_episodes_start_at_the_first_step():
+    data = linear_data((5, 30, 3, 8))
+    chosen = whole_episodes(data, 2, seed=0)
+    starts = torch.from_numpy(data.observations[data.episode_starts])
+    assert len(chosen.lengths) == 2
+    assert all((row == starts).all(-1).any() for row in chosen.observations[:, 0])
