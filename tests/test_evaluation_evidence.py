@@ -1,0 +1,71 @@
+"""The keys and values of reports/metrics.json."""
+
+import numpy as np
+import pytest
+from analytic import linear_data, linear_world
+
+from envtf_lit.evaluation.evidence import collect_metrics, dataset_scores, world_model_metrics
+from envtf_lit.evaluation.returns import Episode, Returns
+from envtf_lit.storage import read_json, write_json
+from envtf_lit.tasks import ROBOTS
+from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
+
+
+def returns(values: list[float]) -> Returns:
+    episode = Episode(0, np.zeros((2, 3)), np.zeros((1, 1)), np.zeros(1), np.zeros((2, 6)))
+    array = np.array(values)
+    scores = np.array([ROBOTS["hopper"].normalised_score(value) for value in values])
+    return Returns(returns=array, lengths=np.ones(len(values)), scores=scores, median=episode)
+
+
+@pytest.fixture(scope="module")
+def metrics() -> dict:
+    data, scale = linear_data((20, 30, 25), noise=0.05), Scale.of(linear_data((20, 30, 25), noise=0.05))
+    report = horizon_report(linear_world(std=0.05), whole_episodes(data, 3, seed=0), scale)
+    return collect_metrics(
+        task="hopper-medium-replay",
+        seed=7,
+        dataset=data,
+        robot=ROBOTS["hopper"],
+        world_model=world_model_metrics(report, scale, parameters=123),
+        rollouts=456,
+        policy=returns([100.0, 300.0]),
+        baselines={"bc": returns([50.0]), "cql": returns([10.0, 20.0, 30.0])},
+    )
+
+
+def test_keys_are_exactly_those_promised(metrics):
+    assert {name: set(value) if isinstance(value, dict) else None for name, value in metrics.items()} == {
+        "task": None,
+        "seed": None,
+        "dataset": {"transitions", "episodes", "score_mean", "score_max"},
+        "world_model": {
+            "parameters",
+            "nmse_one_step",
+            "coverage_50",
+            "coverage_90",
+            "open_loop_steps_0.01",
+            "teacher_forced_steps_0.01",
+        },
+        "rollouts": {"transitions"},
+        "policy": {"score_mean", "score_std", "return_mean", "return_std", "episodes"},
+        "baselines": {"bc", "cql"},
+    }
+    assert all(set(value) == {"score_mean", "score_std"} for value in metrics["baselines"].values())
+
+
+def test_values_survive_json_and_are_right(metrics, tmp_path):
+    write_json(tmp_path / "metrics.json", metrics)
+    assert read_json(tmp_path / "metrics.json") == metrics
+    assert metrics["dataset"]["transitions"] == 75 and metrics["dataset"]["episodes"] == 3
+    assert metrics["policy"]["return_mean"] == 200.0 and metrics["policy"]["return_std"] == 100.0
+    hopper = ROBOTS["hopper"]
+    assert metrics["policy"]["score_mean"] == pytest.approx(hopper.normalised_score(200.0))
+    assert metrics["baselines"]["bc"]["score_std"] == 0.0
+    assert 0.3 < metrics["world_model"]["coverage_50"] < 0.7
+
+
+def test_dataset_scores_are_those_of_its_episodes():
+    data = linear_data((4, 6))
+    expected = [ROBOTS["hopper"].normalised_score(float(data.rewards[a:b].sum())) for a, b in ((0, 4), (4, 10))]
+    np.testing.assert_allclose(dataset_scores(data, ROBOTS["hopper"]), expected, rtol=1e-5)
