@@ -1,0 +1,165 @@
+"""From a tree of plain values to `Params`: types, ranges, and the rules that tie options together."""
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+from envtf_lit.errors import UserError, did_you_mean
+from envtf_lit.params import ModelOptions, Params
+
+
+class Range(NamedTuple):
+    """A test of a number and the words for what passes it."""
+
+    passes: Callable[[float], bool]
+    words: str
+
+
+_FINITE = Range(math.isfinite, "finite")
+_COUNT = Range(lambda value: value >= 1, "1 or more")
+_NOT_NEGATIVE = Range(lambda value: value >= 0, "0 or more")
+_POSITIVE = Range(lambda value: value > 0, "more than 0")
+_SHARE = Range(lambda value: 0 <= value < 1, "in [0, 1)")
+_INNER_SHARE = Range(lambda value: 0 < value < 1, "in (0, 1)")
+_NONZERO_SHARE = Range(lambda value: 0 < value <= 1, "in (0, 1]")
+
+# by the option's name, wherever it stands; of a list, for each of its items
+RANGES: dict[str, Range] = {
+    **dict.fromkeys(("threads", "layers", "heads", "width", "context", "updates", "updates_per_epoch"), _COUNT),
+    **dict.fromkeys(("updates_per_step", "batch_size", "clone_updates", "clone_batch_size", "branches"), _COUNT),
+    **dict.fromkeys(("horizon", "buffer_size", "hidden", "critics", "sampled_actions", "episodes"), _COUNT),
+    **dict.fromkeys(("trajectories",), _COUNT),
+    **dict.fromkeys(("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty"), _NOT_NEGATIVE),
+    **dict.fromkeys(("cql_weight", "warm_start"), _NOT_NEGATIVE),
+    **dict.fromkeys(("learning_rate", "actor_learning_rate", "critic_learning_rate"), _POSITIVE),
+    **dict.fromkeys(("warm_start_learning_rate", "eps", "gradient_clip", "temperature"), _POSITIVE),
+    **dict.fromkeys(("dropout", "warmup", "discount"), _SHARE),
+    "held_out": _INNER_SHARE,
+    **dict.fromkeys(("real_ratio", "target_rate", "actor_average"), _NONZERO_SHARE),
+    "transitions": Range(lambda value: value >= 1000, "1000 or more"),
+    "video_frames": Range(lambda value: 2 <= value <= 150, "from 2 to 150"),
+}
+
+
+def build_params(values: Mapping[str, Any]) -> Params:
+    """The options in a tree of plain values; what is absent takes its default.
+
+    Raises:
+        UserError: an unknown option (with the nearest known one), a value of the wrong type or out of range, or two
+            options that contradict each other.
+    """
+    params = _dataclass(Params, values, "")
+    check_rules(params)
+    return params
+
+
+def _refuse(key: str, value: Any, expected: str) -> typing.NoReturn:
+    shown = "null" if value is None else repr(value)
+    raise UserError(f"{key or 'The top level'} is {shown}, expected {expected}.")
+
+
+def _dataclass(cls: type, value: Any, key: str) -> Any:
+    if not isinstance(value, Mapping):
+        _refuse(key, value, f"a section with the keys {', '.join(field.name for field in dataclasses.fields(cls))}")
+    hints = get_type_hints(cls)
+    for name in value:
+        if name not in hints:
+            where = f"in {key}" if key else "at the top level"
+            raise UserError(f"Unknown option {name!r} {where}: {did_you_mean(str(name), hints)}")
+    prefix = f"{key}." if key else ""
+    return cls(**{name: _value(hints[name], item, prefix + name, name) for name, item in value.items()})
+
+
+def _value(hint: Any, value: Any, key: str, name: str) -> Any:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return _dataclass(typing.cast(type, hint), value, key)
+    if origin in (Union, types.UnionType):  # `X | None` is the only union
+        return None if value is None else _value(arguments[0], value, key, name)
+    if origin is tuple:
+        if not isinstance(value, list | tuple) or not value:
+            _refuse(key, value, "a list such as [256, 256]")
+        return tuple(_value(arguments[0], item, key, name) for item in value)
+    if origin is Literal:
+        if value not in arguments:
+            raise UserError(f"{key} is {value!r}: {did_you_mean(str(value), arguments)}")
+        return value
+    return _number(hint, value, key, name) if hint in (int, float) else _plain(hint, value, key)
+
+
+def _plain(hint: type, value: Any, key: str) -> Any:
+    if not isinstance(value, hint):
+        _refuse(key, value, {bool: "true or false", str: "a text"}[hint])
+    return value
+
+
+def _number(hint: type, value: Any, key: str, name: str) -> Any:
+    kind = "an integer" if hint is int else "a number"
+    limits = RANGES.get(name, _FINITE)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        _refuse(key, value, f"{kind}, {limits.words}")
+    if hint is int and value != int(value):  # 1e6 is a float to YAML and a fine count to everybody
+        _refuse(key, value, f"{kind}, {limits.words}")
+    if not limits.passes(value):
+        _refuse(key, value, f"{kind}, {limits.words}")
+    return hint(value)
+
+
+def check_rules(params: Params) -> None:
+    """The rules that tie options together.
+
+    Raises:
+        UserError: one is broken; the sentence names the options in conflict.
+    """
+    from envtf_lit.tasks import get_task  # late: brings in torch
+
+    get_task(params.task)
+    _check_download(params)
+    _check_model(params.train_model.model)
+    _check_policies(params)
+    _check_history("generate_rollouts", params.generate_rollouts.history, params.train_model.model)
+
+
+def _check_download(params: Params) -> None:
+    source, path = params.download.source, params.download.path
+    if source == "file" and path is None:
+        raise UserError("download.source is 'file' and download.path is null: give the path of your HDF5 or NPZ file.")
+    if source != "file" and path is not None:
+        raise UserError(f"download.path is {path!r} and download.source is {source!r}: set download.source to 'file'.")
+
+
+def _check_model(model: ModelOptions) -> None:
+    if model.width % (2 * model.heads):
+        raise UserError(
+            f"train_model.model.width is {model.width} and heads is {model.heads}: each head needs an even share, so "
+            f"take a width that is a multiple of {2 * model.heads}."
+        )
+
+
+def _check_policies(params: Params) -> None:
+    policies = params.train_policy
+    if policies.cql.imagination is not None:
+        raise UserError("train_policy.cql.imagination must be null: this policy sees data alone, et_cql imagines.")
+    if policies.et_cql.imagination is None:
+        raise UserError(
+            "train_policy.et_cql.imagination is null: give it a section, since train_policy.cql is without."
+        )
+    for name, options in (("cql", policies.cql), ("et_cql", policies.et_cql)):
+        if options.warm_start > options.updates:
+            raise UserError(
+                f"train_policy.{name}.warm_start is {options.warm_start}, more than its updates ({options.updates}): "
+                "the warm start is a part of them."
+            )
+    history = policies.et_cql.imagination.history
+    _check_history("train_policy.et_cql.imagination", history, params.train_model.model)
+
+
+def _check_history(section: str, history: int, model: ModelOptions) -> None:
+    if history > model.context - 1:
+        raise UserError(
+            f"{section}.history is {history} and train_model.model.context is {model.context}: the model remembers at "
+            f"most {model.context - 1} steps before the present one."
+        )
