@@ -170,7 +170,7 @@ def _act(robot: Robot, policy: Policy, rows: int, seeds: list[int], generator: t
     )
     current = [Trace() for _ in seeds]
     begun = list(current)
-    observation, _ = envs.reset(seed=seeds)
+    observation, _ = envs.reset(seed=[*seeds])
     while len(usable := _usable(begun)) == 0 or sum(len(trace.rows) for trace in usable) <= rows:
         action = policy.act(torch.as_tensor(observation, dtype=torch.float32), False, generator).numpy()
         following, reward, terminated, truncated, _ = envs.step(action)

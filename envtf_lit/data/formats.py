@@ -8,7 +8,7 @@ also takes the names `terminated` and `truncated`, and leaves other keys (`infos
 import io
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -110,31 +110,30 @@ def _npz_bytes(arrays: Mapping[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
+def _find_names(present: Iterable[str]) -> dict[str, str]:
+    """Our column to the name it has in a file, for those that are there."""
+    there = set(present)
+    return {column: name for column, names in ALIASES.items() if (name := next((n for n in names if n in there), None))}
+
+
 def _read_hdf5(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     with h5py.File(path, "r") as file:
-        columns = {}
-        for column, names in ALIASES.items():
-            name = next((name for name in names if name in file.keys()), None)
-            if name is not None:
-                columns[column] = _read_hdf5_array(file, name, path)
+        names = _find_names(file)  # iterates over names alone, following no link
+        columns = {column: _read_hdf5_array(file, name, path) for column, name in names.items()}
         return columns, {name: file.attrs[name] for name in ATTRIBUTES if name in file.attrs}
 
 
 def _read_hdf5_array(file: h5py.File, name: str, path: Path) -> np.ndarray:
     """A plain array of this very file: nothing that leads to another file, no objects."""
-    link, item = file.get(name, getlink=True), None
-    if isinstance(link, h5py.HardLink):
+    if isinstance(file.get(name, getlink=True), h5py.HardLink):
         item = file[name]
-    if not isinstance(item, h5py.Dataset) or item.shape is None or item.external or item.is_virtual:
-        raise UserError(f"{path} holds no plain numeric array under {name!r}: store one, without links or objects.")
-    return item[()]
+        if isinstance(item, h5py.Dataset) and item.shape is not None and item.dtype.kind in "biuf":
+            if not item.external and not item.is_virtual:
+                return np.asarray(item)
+    raise UserError(f"{path} holds no plain numeric array under {name!r}: store one, without links or objects.")
 
 
 def _read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     with np.load(path, allow_pickle=False) as file:
-        columns = {}
-        for column, names in ALIASES.items():
-            name = next((name for name in names if name in file.files), None)
-            if name is not None:
-                columns[column] = file[name]
+        columns = {column: file[name] for column, name in _find_names(file.files).items()}
         return columns, {name: file[name] for name in ATTRIBUTES if name in file.files}

@@ -146,7 +146,8 @@ def _inside(actions: np.ndarray, low: np.ndarray, high: np.ndarray, source: str)
         row = int(outside.argmax())
         raise UserError(
             f"{source}: actions reach from {actions.min():g} to {actions.max():g}, outside the action space "
-            f"[{low.min():g}, {high.max():g}], first at row {row}: rescale them, or store 'action_low' and 'action_high'."
+            f"[{low.min():g}, {high.max():g}], first at row {row}: rescale them, or store 'action_low' and "
+            "'action_high'."
         )
     return np.clip(actions, low, high)
 
