@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.params import ModelOptions, Params
+from envtf_lit.params import ModelOptions, Params, PolicyOptions, TrainModelOptions
 
 
 class Range(NamedTuple):
@@ -119,6 +119,7 @@ def check_rules(params: Params) -> None:
     get_task(params.task)
     _check_download(params)
     _check_model(params.train_model.model)
+    _check_epochs("train_model", params.train_model)
     _check_policies(params)
     _check_history("generate_rollouts", params.generate_rollouts.history, params.train_model.model)
 
@@ -148,6 +149,12 @@ def _check_policies(params: Params) -> None:
             "train_policy.et_cql.imagination is null: give it a section, since train_policy.cql is without."
         )
     for name, options in (("cql", policies.cql), ("et_cql", policies.et_cql)):
+        _check_epochs(f"train_policy.{name}", options)
+        if options.updates_per_epoch % options.updates_per_step:
+            raise UserError(
+                f"train_policy.{name}.updates_per_epoch is {options.updates_per_epoch}: take a multiple of "
+                f"updates_per_step ({options.updates_per_step})."
+            )
         if options.warm_start > options.updates:
             raise UserError(
                 f"train_policy.{name}.warm_start is {options.warm_start}, more than its updates ({options.updates}): "
@@ -155,6 +162,14 @@ def _check_policies(params: Params) -> None:
             )
     history = policies.et_cql.imagination.history
     _check_history("train_policy.et_cql.imagination", history, params.train_model.model)
+
+
+def _check_epochs(section: str, options: TrainModelOptions | PolicyOptions) -> None:
+    if options.updates % options.updates_per_epoch:
+        raise UserError(
+            f"{section}.updates is {options.updates}: take a multiple of its updates_per_epoch "
+            f"({options.updates_per_epoch})."
+        )
 
 
 def _check_history(section: str, history: int, model: ModelOptions) -> None:

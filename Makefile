@@ -1,0 +1,76 @@
+# Two commands are all the set-up there is: `make repro` and `make test`.
+#
+#   make repro PRESET=tiny      the whole pipeline in a temporary copy, in minutes
+#   make … TORCH_INDEX=URL      another build of torch, such as https://download.pytorch.org/whl/cpu
+#   make … CONSTRAINTS=FILE     other pinned versions (CONSTRAINTS= for the newest that pyproject.toml allows)
+#   make … PYTHON=python3.12    another Python for a new .venv
+
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+CONSTRAINTS ?= constraints.txt
+TORCH_INDEX ?=
+PRESET ?=
+
+# DVC's stages look for `envtf` on PATH: .venv comes first, whatever is active.
+export VIRTUAL_ENV := $(CURDIR)/.venv
+export PATH := $(VIRTUAL_ENV)/bin:$(PATH)
+unexport PYTHONHOME PYTHONPATH
+
+PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS))
+TORCH = $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+
+.PHONY: help repro test test-all lint clean
+
+help:
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -7
+
+repro: .venv/.installed .dvc/tmp/.ready
+ifeq ($(PRESET),)
+	dvc repro
+	@echo "Done: reports/report.html and reports/metrics.json"
+else
+	@copy=$$(mktemp -d -t envtf-$(PRESET)-XXXXXX); \
+	  envtf init "$$copy" --preset $(PRESET); \
+	  cd "$$copy"; dvc repro; \
+	  echo "Done: $$copy/reports/report.html (the copy is yours to keep or delete)"
+endif
+
+test: .venv/.installed-dev
+	pytest -q
+
+test-all: .venv/.installed-dev
+	pytest -q -m "slow or not slow"
+
+lint: .venv/.installed-dev
+	ruff format --check .
+	ruff check .
+	pyright
+	lint-imports
+
+clean:
+	rm -rf .envtf build dist .pytest_cache .ruff_cache
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+	  { echo "make: Python 3.11 or newer is needed, and $(PYTHON) is $$($(PYTHON) --version 2>&1 || true): give another, such as make PYTHON=python3.12." >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \
+	  { echo "make: $(PYTHON) lacks venv or ensurepip: install them (on Debian and Ubuntu: apt install python3-venv)." >&2; exit 1; }
+	@$(PYTHON) -m venv .venv
+
+.venv/.installed: .venv/bin/python pyproject.toml $(CONSTRAINTS)
+	@echo "Installing into .venv (a few minutes the first time) …"
+	@$(PIP) $(TORCH) --editable .
+	@touch $@
+
+.venv/.installed-dev: .venv/.installed
+	@$(PIP) $(TORCH) --editable '.[dev]'
+	@touch $@
+
+# A download without .git has no SCM for DVC to use.
+.dvc/tmp/.ready: .venv/.installed
+	@mkdir -p .dvc/tmp
+	@git rev-parse --git-dir >/dev/null 2>&1 || dvc config --local core.no_scm true
+	@touch $@

@@ -1,0 +1,179 @@
+"""The command line, `envtf`: a command per stage, Lightning's own command lines, and what helps around them."""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+from envtf_lit.errors import UserError
+
+# what each stage does, and the parts of params.yaml that its help explains
+STAGES = {
+    "download": ("Make or read the dataset: data/dataset.h5", ["download"]),
+    "train_model": ("Train the world model: models/world_model/", ["train_model"]),
+    "generate_rollouts": (
+        "Clone the behaviour and imagine first rollouts: models/behaviour/, data/rollouts.h5",
+        ["generate_rollouts"],
+    ),
+    "train_policy": ("Train a policy: models/policy/ALGORITHM/", ["train_policy.et_cql"]),
+    "evaluate": ("Score policies and model: reports/metrics.json, plots/, video/", ["evaluate"]),
+    "report": ("Execute the report notebook: reports/report.ipynb and .html", []),
+}
+GLOBAL_OPTIONS = ["task", "seed", "threads", "precision"]
+LIGHTNING = {
+    "model": "Lightning's command line of the world model: fit, validate, test (see `envtf model --help`)",
+    "agent": "Lightning's command line of the agents: fit, validate (see `envtf agent --help`)",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs `envtf`; exits with 0, with 2 and a sentence for what the user can mend, with 130 when interrupted."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        _run(arguments)
+    except UserError as error:
+        _fail(str(error), 2)
+    except KeyboardInterrupt:
+        _fail("Interrupted. The same command continues training from the last finished epoch.", 130)
+
+
+def _run(arguments: list[str]) -> None:
+    if arguments and arguments[0] in LIGHTNING:
+        from envtf_lit.lightning_cli import run
+
+        run(arguments[0], arguments[1:])
+        return
+    parser = build_parser()
+    namespace, rest = parser.parse_known_args(arguments)
+    if namespace.command not in STAGES and rest:
+        parser.error(f"unrecognised arguments: {' '.join(rest)}")
+    namespace.run(namespace, rest)
+
+
+def _fail(sentence: str, status: int) -> None:
+    from rich.console import Console
+
+    Console(stderr=True).print(f"envtf: {sentence}", style="red", markup=False, highlight=False, soft_wrap=True)
+    raise SystemExit(status)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line, without what Lightning adds."""
+    parser = argparse.ArgumentParser(
+        "envtf", description="From a log of trajectories to a world model, a policy, and the evidence for both."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_LazyHelp)
+    for name, (summary, sections) in STAGES.items():
+        command = _add(commands, name, summary, _stage, _lazy_options(sections))
+        command.add_argument("--params", default="params.yaml", metavar="FILE", help="default: params.yaml")
+        command.add_argument("--quiet", action="store_true", help="no progress bars")
+        if name == "train_policy":
+            command.add_argument("algorithm", choices=["cql", "et_cql"], help="data alone, or data and imagination")
+    for name, summary in LIGHTNING.items():
+        commands.add_parser(name, help=summary, add_help=False)
+    init = _add(commands, "init", "Write a new project: dvc.yaml, params.yaml, notebooks", _init)
+    init.add_argument("folder", type=Path, help="created if missing; must not hold a dvc.yaml")
+    params = _add(commands, "params", "Print a complete params.yaml", _params)
+    for command in (init, params):
+        command.add_argument("--preset", default="small", help="tiny, small, base or paper; default: small")
+    _add(commands, "doctor", "Print versions, threads, GL, disk and GPU for a bug report", _doctor)
+    return parser
+
+
+class _LazyHelp(argparse.ArgumentParser):
+    """Writes its list of options only when help is asked for: reading them all costs more than most commands."""
+
+    options: Callable[[], str] = staticmethod(lambda: "")
+
+    def format_help(self) -> str:
+        return super().format_help() + self.options()
+
+
+def _add(
+    commands: Any,
+    name: str,
+    summary: str,
+    run: Callable[[argparse.Namespace, list[str]], None],
+    options: Callable[[], str] = lambda: "",
+) -> argparse.ArgumentParser:
+    command = commands.add_parser(name, help=summary, description=f"{summary}.", allow_abbrev=False)
+    command.set_defaults(run=run)
+    command.options = options
+    return command
+
+
+def _lazy_options(sections: list[str]) -> Callable[[], str]:
+    """The part of a stage's help that explains the options in params.yaml."""
+
+    def text() -> str:
+        from envtf_lit.config import describe
+
+        lines = ["", "options of params.yaml, each also a flag, such as --seed 1 or --train_model.updates=500:"]
+        for option in (option for section in [*GLOBAL_OPTIONS, *sections] for option in describe(section)):
+            default = "null" if option.default is None else option.default
+            lines.append(f"  --{option.key}  ({option.kind}, default {default})")
+            lines.append(fill(option.meaning, 110, initial_indent=" " * 8, subsequent_indent=" " * 8))
+        return "\n".join(lines) + "\n"
+
+    return text
+
+
+def _stage(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.config import load_params
+
+    params = load_params(namespace.params, flags_to_overrides(rest))
+    from envtf_lit import pipeline
+
+    extra = {"algorithm": namespace.algorithm} if namespace.command == "train_policy" else {}
+    metrics = getattr(pipeline, namespace.command)(params, **extra, progress=not namespace.quiet)
+    Console().print_json(data=metrics)
+
+
+def flags_to_overrides(flags: Sequence[str]) -> list[str]:
+    """`--a.b 1` and `--a.b=1` as `a.b=1`.
+
+    Raises:
+        UserError: something that is not a flag with a value.
+    """
+    overrides, waiting = [], None
+    for flag in flags:
+        if waiting is not None:
+            overrides.append(f"{waiting}={flag}")
+            waiting = None
+        elif not flag.startswith("--"):
+            raise UserError(f"{flag!r} is not an option: write --section.key value, such as --train_model.updates 500.")
+        elif "=" in flag:
+            overrides.append(flag[2:])
+        else:
+            waiting = flag[2:]
+    if waiting is not None:
+        raise UserError(f"--{waiting} needs a value.")
+    return overrides
+
+
+def _init(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.template import write_project
+
+    write_project(namespace.folder, namespace.preset)
+    Console().print(f"Wrote a project to {namespace.folder}. Next: cd {namespace.folder} && dvc repro", soft_wrap=True)
+
+
+def _params(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from envtf_lit.config import params_yaml, preset_params
+
+    sys.stdout.write(params_yaml(preset_params(namespace.preset)))
+
+
+def _doctor(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.doctor import report
+
+    for name, value in report().items():
+        Console().print(f"{name:<16} {value}", markup=False, highlight=False, soft_wrap=True)
