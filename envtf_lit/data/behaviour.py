@@ -171,7 +171,7 @@ def _act(robot: Robot, policy: Policy, rows: int, seeds: list[int], generator: t
     current = [Trace() for _ in seeds]
     begun = list(current)
     observation, _ = envs.reset(seed=[*seeds])
-    while len(usable := _usable(begun)) == 0 or sum(len(trace.rows) for trace in usable) <= rows:
+    while sum(len(trace.rows) for trace in _usable(begun)) <= rows:
         action = policy.act(torch.as_tensor(observation, dtype=torch.float32), False, generator).numpy()
         following, reward, terminated, truncated, _ = envs.step(action)
         for index, trace in enumerate(current):
@@ -185,12 +185,12 @@ def _act(robot: Robot, policy: Policy, rows: int, seeds: list[int], generator: t
             trace.finished = fell or bool(truncated[index])
         observation = following
     envs.close()
-    return usable
+    return _usable(begun)
 
 
 def _usable(begun: list[Trace]) -> list[Trace]:
     """The finished episodes up to the first running one, and that one, which can still be cut."""
-    first_running = next(index for index, trace in enumerate(begun) if not trace.finished)
+    first_running = next((index for index, trace in enumerate(begun) if not trace.finished), len(begun))
     return begun[: first_running + 1]
 
 

@@ -125,15 +125,15 @@ def _read_hdf5(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 def _read_hdf5_array(file: h5py.File, name: str, path: Path) -> np.ndarray:
     """A plain array of this very file: nothing that leads to another file, no objects."""
-    if isinstance(file.get(name, getlink=True), h5py.HardLink):
-        item = file[name]
-        if isinstance(item, h5py.Dataset) and item.shape is not None and item.dtype.kind in "biuf":
-            if not item.external and not item.is_virtual:
-                return np.asarray(item)
+    item = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+    if isinstance(item, h5py.Dataset) and item.shape is not None and item.dtype.kind in "biuf":
+        outside = item.external or item.is_virtual
+        if not outside:
+            return np.asarray(item)
     raise UserError(f"{path} holds no plain numeric array under {name!r}: store one, without links or objects.")
 
 
 def _read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         columns = {column: file[name] for column, name in _find_names(file.files).items()}
         return columns, {name: file[name] for name in ATTRIBUTES if name in file.files}

@@ -55,11 +55,12 @@ def _check_shapes(columns: Mapping[str, np.ndarray], source: str) -> None:
         if name not in columns:
             extra = {"terminated": " (or 'terminals')", "truncated": " (or 'timeouts')"}.get(name, "")
             raise UserError(f"{source} has no {name!r}{extra}: a dataset needs {', '.join(NEEDED)}.")
-    rows = len(columns["rewards"]) if columns["rewards"].ndim else 0
     for name, values in columns.items():
         if values.ndim != RANKS[name]:
             want = "(N, dimensions)" if RANKS[name] == 2 else "(N,)"
             raise UserError(f"{source}: {name!r} has shape {values.shape}: reshape it to {want}.")
+    rows = len(columns["rewards"])
+    for name, values in columns.items():
         if len(values) != rows:
             raise UserError(
                 f"{source}: {name!r} has {len(values)} rows and 'rewards' has {rows}: write all columns equally long."

@@ -1,0 +1,71 @@
+"""OfflineDataset against hand-computed cases."""
+
+import numpy as np
+import pytest
+
+from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
+from envtf_lit.errors import UserError
+
+
+def make(lengths: list[int]) -> OfflineDataset:
+    """Row i has observation [i, i], successor i + 1, action i / 100 and reward i; episodes end terminated, truncated,
+    terminated and so on."""
+    rows = sum(lengths)
+    index = np.arange(rows, dtype=np.float32)
+    starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
+    last = np.cumsum(lengths) - 1
+    terminated, truncated = np.zeros(rows, bool), np.zeros(rows, bool)
+    terminated[last[::2]], truncated[last[1::2]] = True, True
+    observations = np.stack([index, index], axis=1)
+    limit = np.ones(1, np.float32)
+    return OfflineDataset(
+        observations, index[:, None] / 100, index, observations + 1, terminated, truncated, starts, -limit, limit
+    )
+
+
+def test_episodes():
+    dataset = make([2, 3, 4])
+    assert dataset.episode_lengths.tolist() == [2, 3, 4]
+    assert dataset.episode_ends.tolist() == [2, 5, 9]
+    assert dataset.episode_returns.tolist() == [0 + 1, 2 + 3 + 4, 5 + 6 + 7 + 8]
+    assert dataset.episode_index.tolist() == [0, 0, 1, 1, 1, 2, 2, 2, 2]
+
+
+def test_starts_from_ends():
+    assert starts_from_ends(np.array([False, True, False, False, True])).tolist() == [0, 2]
+    assert starts_from_ends(np.array([False, True, False, False, False])).tolist() == [0, 2]
+
+
+def test_select_keeps_the_order_asked_for():
+    chosen = make([2, 3, 4]).select([2, 0])
+    assert chosen.rewards.tolist() == [5, 6, 7, 8, 0, 1]
+    assert chosen.episode_starts.tolist() == [0, 4]
+    assert chosen.terminated.tolist() == [False] * 3 + [True] + [False, True]
+    assert chosen.next_observations[:, 0].tolist() == [6, 7, 8, 9, 1, 2]
+
+
+def test_select_nothing_is_an_error():
+    with pytest.raises(UserError, match="at least one episode"):
+        make([2, 3]).select([])
+
+
+@pytest.mark.parametrize(("share", "held"), [(0.1, 1), (0.4, 2), (0.99, 4)])
+def test_split_partitions_the_episodes(share: float, held: int):
+    dataset = make([2, 3, 4, 5, 6])
+    train, test = dataset.split(share, seed=0)
+    assert len(test.episode_starts) == held
+    assert sorted([*train.rewards, *test.rewards]) == dataset.rewards.tolist()
+    again = dataset.split(share, seed=0)[1]
+    assert all(np.array_equal(getattr(test, name), getattr(again, name)) for name in COLUMNS)
+
+
+def test_split_needs_two_episodes():
+    with pytest.raises(UserError, match="one episode"):
+        make([4]).split(0.5, seed=0)
+
+
+def test_returns_to_go():
+    dataset = make([2, 3])  # rewards 0 1 | 2 3 4
+    expected = [0 + 0.5 * 1, 1, 2 + 0.5 * (3 + 0.5 * 4), 3 + 0.5 * 4, 4]
+    assert dataset.returns_to_go(0.5).tolist() == expected
+    assert dataset.returns_to_go(0.0).tolist() == dataset.rewards.tolist()
