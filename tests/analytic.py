@@ -18,14 +18,8 @@ class LinearWorld:
     gain: Tensor
     std: float = 0.1
     epistemic: float | None = None
-
-    @property
-    def observation_dim(self) -> int:
-        return len(self.matrix)
-
-    @property
-    def action_dim(self) -> int:
-        return self.gain.shape[1]
+    observation_dim: int = 3
+    action_dim: int = 1
 
     def init(self, observations: Tensor, actions: Tensor, lengths: Tensor) -> Tensor:
         return observations[torch.arange(len(lengths)), lengths - 1]

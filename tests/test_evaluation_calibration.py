@@ -50,4 +50,5 @@ def test_exact_predictions_without_spread_have_no_residual():
     trajectories = whole_episodes(data, 1, seed=0)
     taught = forecast(linear_world(std=0.0), trajectories, feedback="recorded")
     residuals = standardised_residuals(taught, trajectories)
-    assert bool((residuals[:, 2] == 0.0).all()) and not bool(torch.isnan(residuals).any())
+    assert bool((residuals[:, 2] == 0.0).all())
+    assert not bool(torch.isnan(residuals).any())

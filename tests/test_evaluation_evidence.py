@@ -57,8 +57,10 @@ def test_keys_are_exactly_those_promised(metrics):
 def test_values_survive_json_and_are_right(metrics, tmp_path):
     write_json(tmp_path / "metrics.json", metrics)
     assert read_json(tmp_path / "metrics.json") == metrics
-    assert metrics["dataset"]["transitions"] == 75 and metrics["dataset"]["episodes"] == 3
-    assert metrics["policy"]["return_mean"] == 200.0 and metrics["policy"]["return_std"] == 100.0
+    assert metrics["dataset"]["transitions"] == 75
+    assert metrics["dataset"]["episodes"] == 3
+    assert metrics["policy"]["return_mean"] == 200.0
+    assert metrics["policy"]["return_std"] == 100.0
     hopper = ROBOTS["hopper"]
     assert metrics["policy"]["score_mean"] == pytest.approx(hopper.normalised_score(200.0))
     assert metrics["baselines"]["bc"]["score_std"] == 0.0

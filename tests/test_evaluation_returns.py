@@ -44,7 +44,8 @@ def test_an_episode_does_not_depend_on_the_number_beside_it(actor):
     few = evaluate_policy(actor, HOPPER, episodes=3, seed=5, progress=False)
     many = evaluate_policy(actor, HOPPER, episodes=ROWS + 2, seed=5, progress=False)
     np.testing.assert_array_equal(few.returns, many.returns[:3])
-    assert len(many.returns) == ROWS + 2 and len(np.unique(many.returns)) == ROWS + 2
+    assert len(many.returns) == ROWS + 2
+    assert len(np.unique(many.returns)) == ROWS + 2
 
 
 def test_median_episode_is_the_one_of_median_return(actor):

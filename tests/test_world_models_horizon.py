@@ -21,8 +21,10 @@ def test_a_perfect_model_is_censored_everywhere():
     data = linear_data((30, 50, 12))
     report = horizon_report(linear_world(), whole_episodes(data, 10, seed=0), Scale.of(data))
     for steps in (*report.open_loop.values(), *report.teacher_forced.values()):
-        assert steps.censored == 1.0 and steps.mean == pytest.approx((30 + 50 + 12) / 3)
-    assert report.nmse_one_step < 1e-10 and report.explosion_rate == 0.0
+        assert steps.censored == 1.0
+        assert steps.mean == pytest.approx((30 + 50 + 12) / 3)
+    assert report.nmse_one_step < 1e-10
+    assert report.explosion_rate == 0.0
     assert list(report.median_nmse) == [1, 5, 10, 50]
 
 
@@ -54,7 +56,8 @@ def test_errors_equal_those_computed_by_hand(feedback, name):
 def test_open_loop_drifts_where_teacher_forcing_does_not():
     data = linear_data((200, 200, 200))
     report = horizon_report(linear_world(error=0.01), whole_episodes(data, 3, seed=0), Scale.of(data))
-    assert report.open_loop[0.01].mean < 60 and report.teacher_forced[0.01].mean == 200
+    assert report.open_loop[0.01].mean < 60
+    assert report.teacher_forced[0.01].mean == 200
     assert report.open_loop[0.01].mean <= report.open_loop[0.1].mean
     assert report.median_nmse[100] > 10 * report.median_nmse[5]
 
@@ -73,7 +76,8 @@ def test_explosions_and_undefined_predictions_are_counted():
     trajectories, scale = whole_episodes(data, 2, seed=0), Scale.of(data)
     assert horizon_report(exploding, trajectories, scale).explosion_rate == 1.0
     report = horizon_report(undefined, trajectories, scale)
-    assert report.explosion_rate == 1.0 and report.open_loop[0.1].mean == 0.0
+    assert report.explosion_rate == 1.0
+    assert report.open_loop[0.1].mean == 0.0
     assert open_loop_error(undefined, trajectories, scale) == pytest.approx(1e4)
 
 
@@ -81,7 +85,8 @@ def test_selection_prefers_the_better_model_and_is_finite_for_all():
     data = linear_data((60, 60, 60), noise=0.001)
     batch, scale = segments(data, 64, 20, seed=0), Scale.of(data)
     errors = [open_loop_error(linear_world(error), batch, scale) for error in (0.0, 0.01, 0.1, 1.0)]
-    assert errors == sorted(errors) and np.isfinite(errors).all()
+    assert errors == sorted(errors)
+    assert np.isfinite(errors).all()
 
 
 def test_segments_never_cross_an_episode():
@@ -90,7 +95,8 @@ def test_segments_never_cross_an_episode():
     last = batch.targets[:, :-1, :3]
     same = torch.isclose(last, batch.observations[:, 1:]).all(-1)
     assert bool((same | ~batch.valid[:, 1:]).all())
-    assert batch.lengths.min() == 1 and batch.lengths.max() == 8
+    assert batch.lengths.min() == 1
+    assert batch.lengths.max() == 8
     assert torch.equal(batch.observations, segments(data, 200, 8, seed=1).observations)
 
 

@@ -1,0 +1,58 @@
+"""All plots of the evaluate stage, under the names that the report and dvc.yaml know them by."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.evaluation.evidence import dataset_scores
+from envtf_lit.evaluation.returns import Returns
+from envtf_lit.figures import learning, model, scores
+from envtf_lit.figures.style import write_table
+from envtf_lit.tasks import Robot
+from envtf_lit.world_models.horizon import HorizonReport, Scale
+
+
+def draw_dataset(dataset: OfflineDataset, folder: Path) -> None:
+    """`dataset_returns`."""
+    scores.returns_histogram(dataset.episode_returns, dataset.episode_lengths, folder / "dataset_returns.png")
+
+
+def draw_world_model(report: HorizonReport, scale: Scale, robot: Robot, curves: pd.DataFrame, folder: Path) -> None:
+    """`world_model_curves`, `horizon`, `one_step`, `calibration`, `traces`, and the table `horizon_steps.csv`."""
+    learning.learning_curves(
+        {"world_model": curves}, folder / "world_model_curves.png", title="World model, in training"
+    )
+    model.horizon_errors(report, folder / "horizon.png")
+    model.one_step_predictions(report, robot.name, folder / "one_step.png")
+    model.calibration_curve(report, scale, robot.name, folder / "calibration.png")
+    model.traces(report, robot.name, folder / "traces.png")
+    write_table(folder / "horizon_steps.csv", model.horizon_table(report))
+
+
+def draw_rollouts(step: np.ndarray, uncertainty: np.ndarray, folder: Path) -> None:
+    """`rollout_uncertainty`, from the stored rollouts' columns (M,)."""
+    model.rollout_uncertainty(step, uncertainty, folder / "rollout_uncertainty.png")
+
+
+def draw_policies(
+    dataset: OfflineDataset,
+    robot: Robot,
+    returns: Mapping[str, Returns],
+    curves: Mapping[str, pd.DataFrame],
+    folder: Path,
+) -> None:
+    """`scores` and `policy_curves`.
+
+    Args:
+        dataset: its episodes' scores stand first.
+        robot: gives the scores their scale.
+        returns: of `bc`, `cql`, `et_cql`, in this order.
+        curves: the curves.csv of `cql` and `et_cql`.
+        folder: to write into.
+    """
+    by_policy = {name: result.scores for name, result in returns.items()}
+    scores.score_strip({"data": dataset_scores(dataset, robot)} | by_policy, folder / "scores.png")
+    learning.learning_curves(curves, folder / "policy_curves.png", title="Policies, in training")

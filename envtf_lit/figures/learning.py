@@ -1,0 +1,86 @@
+"""Learning curves, read from a model folder's curves.csv whatever columns it holds."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.axes import Axes
+
+from envtf_lit.figures.style import COLOURS, LABELS, drawing, write_table
+
+CLOCKS = ("update", "updates", "step", "epoch")  # columns that count progress rather than measure something
+TITLES = {
+    "loss": "loss (per dimension)",
+    "open_loop_error": "open-loop nmse",
+    "q_data": "Q at the data's actions",
+    "q_policy": "Q at the policy's actions",
+    "conservative_gap": "conservative gap",
+    "bellman_loss": "Bellman loss",
+    "q_target": "TD target",
+    "critic_loss": "critic loss",
+    "warm_critic_loss": "critic loss, warm start",
+    "clone_loss": "actor loss, warm start",
+    "actor_loss": "actor loss",
+    "entropy": "entropy of the policy (nats)",
+    "alpha": "temperature alpha",
+}
+MOST_PANELS = 12
+
+
+def tidy_curves(runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Curves of several runs as rows (run, split, quantity, clock, at, value); empty cells are dropped.
+
+    A column `train/loss` has split `train` and quantity `loss`; a column without a slash has split `train`.
+    """
+    parts = []
+    for run, curves in runs.items():
+        clock = next((name for name in CLOCKS if name in curves.columns), None)
+        at = curves[clock] if clock is not None else pd.Series(range(len(curves)))
+        for column in curves.columns.difference(CLOCKS, sort=False):
+            values = pd.to_numeric(curves[column], errors="coerce")
+            split, _, quantity = column.rpartition("/")
+            rows = {"split": split or "train", "quantity": quantity, "clock": clock or "row", "at": at, "value": values}
+            parts.append(pd.DataFrame({"run": run, **rows}).dropna())
+    return pd.concat(parts, ignore_index=True)
+
+
+def learning_curves(runs: Mapping[str, pd.DataFrame], path: str | Path, *, title: str) -> Path:
+    """One panel per logged quantity, one line per run; validation is dashed.
+
+    Args:
+        runs: name of the run (`cql`, `et_cql`, `world_model`) to its curves.csv.
+        path: PNG to write; the numbers go beside it as CSV.
+        title: over all panels.
+    """
+    table = tidy_curves(runs)
+    quantities = list(table["quantity"].unique())[:MOST_PANELS]
+    columns = min(3, len(quantities))
+    rows = math.ceil(len(quantities) / columns)
+    with drawing(path, (4.2 * columns, 2.9 * rows + 0.6), rows, columns) as (figure, axes):
+        for axis, quantity in zip(axes.flat, quantities, strict=False):
+            _panel(axis, table.loc[table["quantity"] == quantity, :], quantity, single=len(runs) == 1)
+        for axis in list(axes.flat)[len(quantities) :]:
+            axis.set_axis_off()
+        figure.suptitle(title)
+        lines = {line.get_label(): line for axis in axes.flat for line in axis.get_lines()}
+        figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=len(lines))
+    write_table(path, table)
+    return Path(path)
+
+
+def _panel(axis: Axes, lines: pd.DataFrame, quantity: str, *, single: bool) -> None:
+    for run, split in dict.fromkeys(zip(lines["run"], lines["split"], strict=True)):
+        line = lines[(lines["run"] == run) & (lines["split"] == split)]
+        validated = split != "train"
+        label = (
+            ("held out" if validated else "training") if single else LABELS.get(str(run), str(run)).replace("\n", " ")
+        )
+        colour = COLOURS["imagined" if validated else "recorded"] if single else COLOURS.get(run)
+        axis.plot(
+            line["at"], line["value"], color=colour, linestyle="--" if validated else "-", label=label, marker="."
+        )
+    values = lines["value"].to_numpy()
+    if values.min() > 0 and values.max() > 30 * values.min():
+        axis.set_yscale("log")
+    axis.set(title=TITLES.get(quantity, quantity.replace("_", " ")), xlabel=lines["clock"].iloc[0])

@@ -1,0 +1,82 @@
+"""One look for every plot: colours by meaning, labels with units, and PNG files with the same bytes every time."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import pandas as pd
+import seaborn as sns
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from envtf_lit.storage import replacing
+from envtf_lit.tasks import ROBOTS
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart
+COLOURS = {
+    "data": "#8c8c8c",
+    "bc": "#E69F00",
+    "cql": "#0072B2",
+    "et_cql": "#009E73",
+    "recorded": "#333333",
+    "imagined": "#D55E00",
+    "taught": "#56B4E9",
+    "threshold": "#999999",
+}
+LABELS = {
+    "data": "dataset",
+    "bc": "behaviour clone",
+    "cql": "CQL on data",
+    "et_cql": "CQL on data\nand imagination",
+    "world_model": "world model",
+}
+JOINTS = {
+    "hopper": ("thigh", "leg", "foot"),
+    "walker2d": ("right thigh", "right leg", "right foot", "left thigh", "left leg", "left foot"),
+    "halfcheetah": ("back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot"),
+    "ant": tuple(f"{part} {leg}" for leg in (1, 2, 3, 4) for part in ("hip", "ankle")),
+}
+
+
+def observation_labels(robot: str | None, observation_dim: int) -> list[str]:
+    """Name and unit of each observation dimension; `s[i]` for robots that are not ours."""
+    if robot not in JOINTS or ROBOTS[robot].observation_dim != observation_dim:
+        return [f"s[{i}]" for i in range(observation_dim)]
+    joints = JOINTS[robot]
+    angles, rates = [f"{joint} angle (rad)" for joint in joints], [f"{joint} rate (rad/s)" for joint in joints]
+    if robot == "ant":
+        pose = ["torso height (m)", *(f"torso quaternion {axis}" for axis in "wxyz")]
+        motion = [f"{axis} velocity (m/s)" for axis in "xyz"] + [f"{axis} rotation (rad/s)" for axis in "xyz"]
+    else:
+        pose = ["torso height (m)", "torso pitch (rad)"]
+        motion = ["x velocity (m/s)", "z velocity (m/s)", "pitch rate (rad/s)"]
+    return [*pose, *angles, *motion, *rates]
+
+
+def featured(observation_dim: int) -> list[int]:
+    """Up to four dimensions worth showing: the first two, the middle one (our robots' x velocity) and the last."""
+    return sorted({0, min(1, observation_dim - 1), observation_dim // 2, observation_dim - 1})
+
+
+@contextmanager
+def drawing(
+    path: str | Path, size: tuple[float, float], rows: int = 1, columns: int = 1
+) -> Iterator[tuple[Figure, Any]]:
+    """Yields a figure of `size` inches and its (rows, columns) array of axes, and writes it to `path` as PNG.
+
+    Neither pyplot nor the user's back-end and settings are touched.
+    """
+    with matplotlib.rc_context(), sns.axes_style("whitegrid"), sns.plotting_context("notebook", font_scale=0.9):
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure, figure.subplots(rows, columns, squeeze=False)
+        with replacing(path) as temporary:
+            figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})
+
+
+def write_table(path: str | Path, table: pd.DataFrame) -> None:
+    """Writes the numbers behind a plot beside it, as CSV."""
+    with replacing(Path(path).with_suffix(".csv")) as temporary:
+        table.to_csv(temporary, index=False, float_format="%.6g", lineterminator="\n")
