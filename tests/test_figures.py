@@ -65,10 +65,10 @@ def test_every_plot_is_a_picture_with_its_numbers(drawn):
     expected = {f"{name}.{suffix}" for name in PLOTS for suffix in ("png", "csv")} | {"horizon_steps.csv"}
     assert set(digests(drawn)) == expected
     for path in drawn.glob("*.png"):
-        picture = Image.open(path)
-        assert "Software" not in picture.info
-        assert min(picture.size) >= 300
-        assert len(picture.convert("RGB").getcolors(1 << 24) or []) > 20  # something was drawn
+        with Image.open(path) as picture:
+            assert "Software" not in picture.info
+            assert min(picture.size) >= 300
+            assert len(picture.convert("RGB").getcolors(1 << 24) or []) > 20  # something was drawn
     for path in drawn.glob("*.csv"):
         assert len(pd.read_csv(path)) > 0
 
@@ -82,9 +82,8 @@ def test_plots_have_the_same_bytes_every_time(drawn, tmp_path):
 def test_the_numbers_behind_the_plots_are_right(drawn):
     steps = pd.read_csv(drawn / "horizon_steps.csv")
     assert list(steps["run"]) == ["open loop", "open loop", "teacher-forced", "teacher-forced"]
-    scores = pd.read_csv(drawn / "scores.csv").groupby("policy")["score"].mean().to_dict()
-    assert scores["et_cql"] == 32.0
-    assert scores["bc"] == 7.0
+    scores = pd.read_csv(drawn / "scores.csv")
+    assert scores.loc[scores["policy"] == "et_cql", "score"].tolist() == [30.0, 31.0, 32.0, 33.0, 34.0]
     uncertainty = pd.read_csv(drawn / "rollout_uncertainty.csv")
     assert list(uncertainty["transitions"]) == [50, 50, 50]
     assert uncertainty["median"].is_monotonic_increasing

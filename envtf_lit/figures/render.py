@@ -1,0 +1,95 @@
+"""Draws a robot in given poses; meant to run as a child process, since MUJOCO_GL must be set before MuJoCo is imported.
+
+    python -m envtf_lit.figures.render poses.npz frames.npz
+
+With MUJOCO_GL set to `egl` or `osmesa` MuJoCo renders; with `disabled` the links are drawn as lines.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is a compiled module without type stubs)
+
+import os
+import sys
+
+import gymnasium
+import mujoco
+import numpy as np
+from PIL import Image, ImageDraw
+
+VIEW = 2.6  # metres across the drawn picture
+SHARPNESS = 3  # drawn larger by this factor, then shrunk, for smooth edges
+
+
+def render(model: mujoco.MjModel, positions: np.ndarray, size: int) -> np.ndarray:
+    """Poses (F, Q) to frames (F, size, size, 3) uint8, through MuJoCo's renderer."""
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+    camera.trackbodyid, camera.distance, camera.elevation, camera.azimuth = 1, 3.2, -12.0, 90.0
+    frames, data = [], mujoco.MjData(model)
+    with mujoco.Renderer(model, size, size) as renderer:
+        for pose in positions:
+            data.qpos[:] = pose
+            mujoco.mj_kinematics(model, data)  # no dynamics: an imagined pose may be impossible
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_camlight(model, data)
+            renderer.update_scene(data, camera)
+            for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+                renderer.scene.flags[flag] = 0  # half the time of software rendering
+            frames.append(renderer.render())
+    return np.stack(frames)
+
+
+def draw(model: mujoco.MjModel, positions: np.ndarray, size: int) -> np.ndarray:
+    """Poses (F, Q) to frames (F, size, size, 3) uint8: capsules and spheres seen from the side, without any GL."""
+    data = mujoco.MjData(model)
+    frames = []
+    for pose in positions:
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        frames.append(_side_view(model, data, size))
+    return np.stack(frames)
+
+
+def _side_view(model: mujoco.MjModel, data: mujoco.MjData, size: int) -> np.ndarray:
+    scale = SHARPNESS * size / VIEW
+    image = Image.new("RGB", (SHARPNESS * size, SHARPNESS * size), (236, 240, 245))
+    pen = ImageDraw.Draw(image)
+    left, ground = data.xpos[1, 0] - VIEW / 2, 0.85 * image.height
+
+    def pixel(point: np.ndarray) -> tuple[float, float]:
+        return (point[0] - left) * scale, ground - point[2] * scale
+
+    pen.rectangle((0, ground, image.width, image.height), fill=(205, 212, 220))
+    for metre in range(int(np.floor(left)), int(np.ceil(left + VIEW)) + 1):  # marks that show the robot's progress
+        mark = (metre - left) * scale
+        pen.line((mark, ground, mark, image.height), fill=(160, 168, 178), width=SHARPNESS)
+    rounded = {int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_SPHERE)}
+    for i in np.argsort(-data.geom_xpos[:, 1], kind="stable"):  # what is farther away first
+        if model.geom_bodyid[i] != 0 and int(model.geom_type[i]) in rounded:
+            half = data.geom_xmat[i].reshape(3, 3)[:, 2] * model.geom_size[i, 1]  # (3,) centre to cap
+            ends = pixel(data.geom_xpos[i] - half), pixel(data.geom_xpos[i] + half)
+            colour = tuple(int(255 * c) for c in model.geom_rgba[i, :3])
+            _capsule(pen, *ends, model.geom_size[i, 0] * scale, colour)
+    return np.asarray(image.resize((size, size), Image.Resampling.BOX))
+
+
+def _capsule(pen: ImageDraw.ImageDraw, start: tuple, end: tuple, radius: float, colour: tuple) -> None:
+    for grow, fill in ((SHARPNESS, (60, 60, 60)), (0, colour)):  # a dark rim, then the body
+        pen.line((*start, *end), fill=fill, width=round(2 * (radius + grow)))
+        for x, y in (start, end):
+            r = radius + grow
+            pen.ellipse((x - r, y - r, x + r, y + r), fill=fill)
+
+
+def main(source: str, target: str) -> None:
+    """Reads `env_id`, `positions` (F, Q) and `size`, writes `frames` (F, size, size, 3)."""
+    with np.load(source, allow_pickle=False) as given:
+        env_id, positions, size = str(given["env_id"]), given["positions"], int(given["size"])
+    env = gymnasium.make(env_id, disable_env_checker=True)
+    model = env.unwrapped.model
+    paint = draw if os.environ.get("MUJOCO_GL") == "disabled" else render
+    np.savez_compressed(target, frames=paint(model, positions, size))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

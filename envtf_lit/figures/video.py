@@ -1,0 +1,162 @@
+"""The real robot beside the imagined one, under the same actions, as a GIF."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+
+from envtf_lit.errors import UserError
+from envtf_lit.evaluation.returns import Episode
+from envtf_lit.figures.style import COLOURS
+from envtf_lit.storage import replacing
+from envtf_lit.tasks import ROBOTS, Robot
+from envtf_lit.world_models.horizon import Scale, Trajectories, forecast, nmse
+from envtf_lit.world_models.interface import WorldModel
+
+BACKENDS = ("egl", "osmesa", "disabled")  # of MUJOCO_GL, best first; without any GL the links are drawn as lines
+MOST_FRAMES = 150
+STRIDE = 2  # simulated steps per frame
+FRAME_MILLISECONDS = 40
+SIZE, HEADER = 240, 24  # pixels
+TIMEOUT = 300.0  # seconds; a renderer that hangs counts as missing
+
+
+def real_vs_imagined(
+    model: WorldModel, episode: Episode, robot: Robot, scale: Scale, path: str | Path, *, frames: int = MOST_FRAMES
+) -> str:
+    """Writes a GIF: left what MuJoCo did, right what the model imagines of the same actions from the same first state.
+
+    The imagination runs open loop with mean predictions and never sees a real state again.
+
+    Args:
+        model: in eval mode, on the CPU.
+        episode: a real one.
+        robot: whose episode it is.
+        scale: the training data's units, for the error shown.
+        path: GIF to write.
+        frames: at most 150, of 2 steps each; fewer where the episode ends.
+
+    Returns:
+        What drew the frames: `egl`, `osmesa`, or `disabled` where no GL works and the links were drawn as lines.
+
+    Raises:
+        UserError: the number of frames is not in [1, 150].
+    """
+    if not 1 <= frames <= MOST_FRAMES:
+        raise UserError(
+            f"A video has 1 to {MOST_FRAMES} frames: {frames} were asked for; change evaluate.video_frames."
+        )
+    steps = min(len(episode.actions), STRIDE * (frames - 1))
+    states, error = _imagine(model, episode, scale, max(steps, 1))
+    shown = np.arange(0, steps + 1, STRIDE)
+    imagined = imagined_positions(robot, states, episode.positions[0])
+    poses = np.concatenate([episode.positions[shown], imagined[shown]])
+    backend = working_backend()
+    pictures = _render(robot, poses, SIZE, backend)
+    pairs = zip(pictures[: len(shown)], pictures[len(shown) :], shown, strict=True)
+    lost = np.maximum.accumulate(error) > 0.1  # from the first passage on
+    write_gif([_page(real, dream, int(h), float(error[h]), bool(lost[h])) for real, dream, h in pairs], path)
+    return backend
+
+
+def _imagine(model: WorldModel, episode: Episode, scale: Scale, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """States (steps + 1, S), the first one real, and the open-loop nmse (steps + 1,) of each."""
+    observations = torch.from_numpy(episode.observations[: steps + 1])
+    rewards = torch.from_numpy(episode.rewards[:steps]).float()
+    targets = torch.cat([observations[1:], rewards[:, None]], dim=-1)
+    actions = torch.from_numpy(episode.actions[:steps])
+    recorded = Trajectories(observations[None, :-1], actions[None], targets[None], torch.tensor([len(actions)]))
+    mean = forecast(model, recorded, feedback="imagined").mean
+    states = torch.cat([observations[:1], mean[0, :, :-1]])
+    return states.numpy(), np.append(0.0, nmse(mean, recorded, scale)[0].numpy())
+
+
+def imagined_positions(robot: Robot, states: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """The simulator's coordinates `qpos` (T, Q) of observations (T, S), from the real `qpos` (Q,) of the first.
+
+    Observations leave out where on the plane the robot is: the first coordinate of our planar robots, two of Ant's.
+    They are integrated from the velocities. States that are not finite repeat the last finite one.
+    """
+    hidden = len(start) + _velocities(robot) - states.shape[1]
+    finite = np.isfinite(states).all(1)
+    states = states[np.maximum.accumulate(np.where(finite, np.arange(len(states)), 0))]
+    seen = len(start) - hidden
+    velocity = states[1:, seen : seen + hidden]
+    plane = start[:hidden] + np.concatenate([np.zeros((1, hidden)), np.cumsum(_time_step(robot) * velocity, axis=0)])
+    return np.concatenate([plane, states[:, :seen]], axis=1)
+
+
+@cache
+def _simulator(robot_env_id: str) -> tuple[int, float]:
+    env = gymnasium.make(robot_env_id, disable_env_checker=True)
+    raw = env.unwrapped
+    return raw.model.nv, raw.dt  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _velocities(robot: Robot) -> int:
+    return _simulator(robot.env_id)[0]
+
+
+def _time_step(robot: Robot) -> float:
+    return _simulator(robot.env_id)[1]
+
+
+def _render(robot: Robot, positions: np.ndarray, size: int, backend: str) -> np.ndarray:
+    """Frames (F, size, size, 3) from a child process whose MuJoCo uses this back-end."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = f"{folder}/poses.npz", f"{folder}/frames.npz"
+        np.savez(source, env_id=robot.env_id, positions=positions, size=size)
+        subprocess.run(
+            [sys.executable, "-m", "envtf_lit.figures.render", source, target],
+            env=os.environ | {"MUJOCO_GL": backend},
+            check=True,
+            capture_output=True,
+            timeout=TIMEOUT,
+        )
+        with np.load(target, allow_pickle=False) as result:
+            return result["frames"]
+
+
+@cache
+def working_backend() -> str:
+    """The first of `egl`, `osmesa`, `disabled` with which a child process renders a picture that is not blank."""
+    robot = ROBOTS["hopper"]
+    for backend in BACKENDS[:-1]:
+        try:
+            picture = _render(robot, np.array([[0.0, 1.25, 0.0, 0.0, 0.0, 0.0]]), 32, backend)
+        except (subprocess.SubprocessError, OSError):
+            continue
+        if picture.std() > 1.0:
+            return backend
+    return BACKENDS[-1]
+
+
+def _page(real: np.ndarray, imagined: np.ndarray, step: int, error: float, lost: bool) -> Image.Image:
+    height, width, _ = real.shape
+    page = Image.new("RGB", (2 * width + 4, height + 2 * HEADER), "white")
+    page.paste(Image.fromarray(real), (0, HEADER))
+    page.paste(Image.fromarray(imagined), (width + 4, HEADER))
+    pen, font = ImageDraw.Draw(page), ImageFont.load_default(14)
+    middle = {"anchor": "mm", "font": font}
+    pen.text((width / 2, HEADER / 2), "real (MuJoCo)", fill="black", **middle)
+    pen.text((1.5 * width + 4, HEADER / 2), "imagined (world model)", fill="black", **middle)
+    note = f"step {step}    normalised squared error {min(error, 999):.3g}" + ("  (has passed 0.1)" if lost else "")
+    pen.text((width + 2, height + 1.5 * HEADER), note, fill=COLOURS["imagined"] if lost else "black", **middle)
+    return page
+
+
+def write_gif(pages: list[Image.Image], path: str | Path) -> None:
+    """Writes an endless GIF of 25 frames per second, all frames in the palette of the middle one."""
+    palette = pages[len(pages) // 2].quantize(64, dither=Image.Dither.NONE)
+    indexed = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in pages]
+    with replacing(path) as temporary:
+        indexed[0].save(
+            temporary, format="GIF", save_all=True, append_images=indexed[1:], duration=FRAME_MILLISECONDS, loop=0
+        )
