@@ -1,0 +1,18 @@
+"""Environment Transformer and Conservative Q-Learning: from a log of trajectories to a world model and a policy."""
+
+from importlib import import_module
+from typing import Any
+
+_EXPORTS = {
+    "load_dataset": "envtf_lit.data.formats",
+    "load_policy": "envtf_lit.policy",
+    "load_world_model": "envtf_lit.world_models.store",
+}
+__all__ = ["load_dataset", "load_policy", "load_world_model"]  # noqa: F822 (imported on first use)
+
+
+def __getattr__(name: str) -> Any:
+    """Imports on first use, so that `import envtf_lit` and `envtf --help` need not load torch."""
+    if name in _EXPORTS:
+        return getattr(import_module(_EXPORTS[name]), name)
+    raise AttributeError(f"module 'envtf_lit' has no attribute {name!r}")

@@ -113,6 +113,7 @@ class ImaginationOptions:
         history: real steps given to the model before the branch point.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
         buffer_size: imagined transitions kept; the oldest leave first.
+        multi_step: temporal-difference targets run to the end of the imagined rollout, not one step.
         penalty: weight of the uncertainty u, in units of the data's reward standard deviation: `r - weight * std * u`.
         penalty_up_on: rows on which the conservative term pushes Q up: `real` (COMBO's form) or `mixture` (the
             paper's equation 5 read literally, which rewards the policy's own imagined actions).
@@ -125,6 +126,7 @@ class ImaginationOptions:
     history: int = 4
     mode: Literal["mean", "sample"] = "sample"
     buffer_size: int = 100_000
+    multi_step: bool = True
     penalty: float = 0.0
     penalty_up_on: Literal["real", "mixture"] = "real"
 
@@ -142,14 +144,17 @@ class PolicyOptions:
         critics: Q-functions, of which the target takes the smallest.
         layer_norm: LayerNorm in the critics.
         discount: of future rewards, per step.
+        n_step: real steps whose rewards enter the temporal-difference target.
         target_rate: share of the critics that enters the target networks at each update.
         actor_learning_rate: Adam's.
         critic_learning_rate: Adam's.
         cql_weight: weight of the conservative term.
+        initial_alpha: weight of the entropy in the actor's objective at the start; learned from there on.
         sampled_actions: actions of each kind (uniform, pi(s), pi(s')) in the log-sum-exp.
         temperature: of the log-sum-exp.
         warm_start: first updates, in which the critics fit Monte-Carlo returns and the actor clones the data.
         warm_start_learning_rate: Adam's, of both, during the warm start.
+        actor_average: share of the actor that enters the averaged actor at each update; the average is what is saved.
         imagination: None trains on data alone.
     """
 
@@ -161,14 +166,17 @@ class PolicyOptions:
     critics: int = 2
     layer_norm: bool = True
     discount: float = 0.99
+    n_step: int = 1
     target_rate: float = 0.005
     actor_learning_rate: float = 0.0001
     critic_learning_rate: float = 0.0003
     cql_weight: float = 5.0
+    initial_alpha: float = 0.1
     sampled_actions: int = 4
     temperature: float = 1.0
     warm_start: int = 2_000
     warm_start_learning_rate: float = 0.001
+    actor_average: float = 0.005
     imagination: ImaginationOptions | None = None
 
 

@@ -1,0 +1,242 @@
+"""What offline actor-critic agents share: batches of data and imagination, the warm start, targets, the update loop."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor, nn
+
+from envtf_lit.agents.networks import StackedCritics
+from envtf_lit.agents.ring import ImaginedRing
+from envtf_lit.data.loaders import epoch_generator
+from envtf_lit.imagination import BranchPoints, Rollouts, imagine
+from envtf_lit.params import ImaginationOptions, PolicyOptions
+from envtf_lit.policy import TanhGaussianActor
+from envtf_lit.world_models.interface import WorldModel
+
+Batch = dict[str, Tensor]
+
+
+class OfflineAgent(L.LightningModule):
+    """Actor, critics and their targets, updated several times per training step (manual optimisation).
+
+    A batch holds (K, B, …) transitions for K gradient steps; there is no host synchronisation between them. With
+    imagination, `1 - real_ratio` of each B rows is replaced by rows of the imagined ring.
+
+    Logged names are explained in docs/metrics.md.
+    """
+
+    log_alpha: nn.Parameter
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        options: PolicyOptions | dict[str, Any] | None = None,
+        action_low: list[float] | None = None,
+        action_high: list[float] | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.options = _policy_options(options)
+        self.save_hyperparameters(
+            dict(
+                observation_dim=observation_dim,
+                action_dim=action_dim,
+                options=asdict(self.options) | {"hidden": list(self.options.hidden)},
+                action_low=action_low,
+                action_high=action_high,
+                seed=seed,
+            )
+        )
+        self.automatic_optimization = False
+        self.seed = seed
+        self.actor = TanhGaussianActor(
+            observation_dim, action_dim, hidden=self.options.hidden, action_low=action_low, action_high=action_high
+        )
+        self.critics = StackedCritics(
+            observation_dim,
+            action_dim,
+            n=self.options.critics,
+            hidden=self.options.hidden,
+            layer_norm=self.options.layer_norm,
+        )
+        self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
+        self.average_actor = copy.deepcopy(self.actor).requires_grad_(False)
+        self.log_alpha = nn.Parameter(torch.tensor(self.options.initial_alpha).log())
+        self.ring: ImaginedRing | None = None
+        if self.options.imagination is not None:
+            self.ring = ImaginedRing(observation_dim, action_dim, self.options.imagination.buffer_size)
+        self._imagine: Callable[[torch.Generator], Rollouts] | None = None
+        self.reward_std = 1.0
+
+    def normalise_with(self, mean: Tensor, std: Tensor) -> None:
+        """Sets the observation scale of every network."""
+        for network in (self.actor, self.average_actor, self.critics, self.target_critics):
+            network.observation_mean.copy_(mean)
+            network.observation_std.copy_(std)
+
+    def dream_with(
+        self, model: WorldModel, starts: BranchPoints, terminated: Callable[[Tensor], Tensor], first: Rollouts
+    ) -> None:
+        """Gives the agent a world model to imagine with, and the stored rollouts to begin with."""
+        assert self.ring is not None and self.options.imagination is not None
+        imagination = self.options.imagination
+        self.remember(first)
+
+        def dream(generator: torch.Generator) -> Rollouts:
+            return imagine(
+                model,
+                self.actor,
+                starts.draw(imagination.branches, imagination.history, generator),
+                horizon=imagination.horizon,
+                terminated=terminated,
+                mode=imagination.mode,
+                generator=generator,
+            )
+
+        self._imagine = dream
+
+    # Lightning hooks
+
+    def on_train_epoch_start(self) -> None:
+        self.generator = epoch_generator(self.seed, self.current_epoch, "agent")
+        self.update_index = self.current_epoch * self.options.updates_per_epoch
+        self.log_sums: dict[str, Tensor] = {}
+
+    def training_step(self, batch: Batch, batch_index: int) -> None:
+        for k in range(len(batch["rewards"])):
+            logs = self.update({name: column[k] for name, column in batch.items()})
+            for name, value in logs.items():
+                self.log_sums[name] = self.log_sums.get(name, 0.0) + value.detach()
+            self.update_index += 1
+
+    def on_train_epoch_end(self) -> None:
+        updates = self.options.updates_per_epoch
+        self.log_dict({f"train/{name}": value / updates for name, value in self.log_sums.items()}, prog_bar=False)
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        o = self.options
+        actor = torch.optim.Adam(self.actor.parameters(), lr=o.actor_learning_rate)
+        critics = torch.optim.Adam(self.critics.parameters(), lr=o.critic_learning_rate)
+        alpha = torch.optim.Adam([self.log_alpha], lr=o.actor_learning_rate)
+        return [actor, critics, alpha]
+
+    # One gradient step
+
+    def update(self, batch: Batch) -> dict[str, Tensor]:
+        """One gradient step of every part; returns detached scalars to log."""
+        if self.update_index < self.options.warm_start:
+            return self.warm_up(batch)
+        batch = self.mix(batch)
+        actor_optimizer, critic_optimizer, alpha_optimizer = self._optimizers()
+        critic_loss, logs = self.critic_loss(batch, self.generator)
+        _descend(self, critic_optimizer, critic_loss)
+        self.critics.requires_grad_(False)
+        actor_loss, actor_logs = self.actor_loss(batch, self.generator)
+        _descend(self, actor_optimizer, actor_loss)
+        self.critics.requires_grad_(True)
+        _descend(self, alpha_optimizer, self.temperature_loss(actor_logs["entropy"]))
+        self.follow()
+        return logs | actor_logs | dict(alpha=self.log_alpha.exp())
+
+    def warm_up(self, batch: Batch) -> dict[str, Tensor]:
+        """Critics regress on Monte-Carlo returns of the log, the actor clones it."""
+        actor_optimizer, critic_optimizer, _ = self._optimizers()
+        q = self.critics(batch["observations"], batch["actions"])
+        critic_loss = 0.5 * (q - batch["returns"]).square().mean(1).sum()
+        _descend(self, critic_optimizer, critic_loss)
+        clone_loss = -self.actor.log_prob(batch["observations"], batch["actions"]).mean()
+        _descend(self, actor_optimizer, clone_loss)
+        if self.update_index == self.options.warm_start - 1:
+            self.target_critics.load_state_dict(self.critics.state_dict())
+            self.average_actor.load_state_dict(self.actor.state_dict())
+        return dict(warm_critic_loss=critic_loss, clone_loss=clone_loss, q_data=q.mean())
+
+    def _optimizers(self) -> list[Any]:
+        """The three optimisers, at the learning rates of the current phase."""
+        o, warm = self.options, self.update_index < self.options.warm_start
+        rates = [o.actor_learning_rate, o.critic_learning_rate, o.actor_learning_rate]
+        optimizers: list[Any] = self.optimizers()  # pyright: ignore[reportAssignmentType]
+        for optimizer, rate in zip(optimizers, rates, strict=True):
+            optimizer.param_groups[0]["lr"] = o.warm_start_learning_rate if warm else rate
+        return optimizers
+
+    def mix(self, batch: Batch) -> Batch:
+        """Replaces the last rows of a real batch by imagined ones; `real` (B,) marks what is real."""
+        imagination = self.options.imagination
+        total = len(batch["rewards"])
+        real = torch.ones(total, device=self.device)
+        if imagination is None or self.ring is None:
+            return batch | {"real": real}
+        if self._imagine is not None and self._refresh_now(imagination):
+            self.remember(self._imagine(self.generator))
+        number = total - round(imagination.real_ratio * total)
+        imagined = self.ring.draw(number, self.generator)
+        real[total - number :] = 0.0
+        names = ("observations", "actions", "rewards", "next_observations", "discounts")
+        return {name: torch.cat([batch[name][: total - number], imagined[name]]) for name in names} | {"real": real}
+
+    def remember(self, rollouts: Rollouts) -> None:
+        """Puts rollouts into the ring, rewards less the penalty `weight * std(r) * u`."""
+        imagination = self.options.imagination
+        assert self.ring is not None and imagination is not None
+        rewards = rollouts.rewards - imagination.penalty * self.reward_std * rollouts.uncertainty
+        if imagination.multi_step:
+            total, end, weight = rollouts.returns(rewards, self.options.discount)
+        else:
+            weight = self.options.discount * (~rollouts.terminated).float()
+            total, end = rewards, rollouts.next_observations
+        self.ring.add(
+            dict(
+                observations=rollouts.observations,
+                actions=rollouts.actions,
+                rewards=total,
+                next_observations=end,
+                discounts=weight,
+            )
+        )
+
+    def _refresh_now(self, imagination: ImaginationOptions) -> bool:
+        every = imagination.refresh_every
+        return every > 0 and (self.update_index - self.options.warm_start) % every == 0
+
+    @torch.no_grad()
+    def follow(self) -> None:
+        """Targets move towards the critics, the averaged actor towards the actor."""
+        rate = self.options.target_rate
+        torch._foreach_lerp_(list(self.target_critics.parameters()), list(self.critics.parameters()), rate)
+        rate = self.options.actor_average
+        torch._foreach_lerp_(list(self.average_actor.parameters()), list(self.actor.parameters()), rate)
+
+    # What an algorithm defines
+
+    def critic_loss(self, batch: Batch, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        raise NotImplementedError
+
+    def actor_loss(self, batch: Batch, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        raise NotImplementedError
+
+    def temperature_loss(self, entropy: Tensor) -> Tensor:
+        raise NotImplementedError
+
+
+def _descend(module: L.LightningModule, optimizer: Any, loss: Tensor) -> None:
+    optimizer.zero_grad(set_to_none=True)
+    module.manual_backward(loss)
+    optimizer.step()
+
+
+def _policy_options(options: PolicyOptions | dict[str, Any] | None) -> PolicyOptions:
+    """Options as given, or rebuilt from the plain dictionary of a checkpoint."""
+    if options is None:
+        return PolicyOptions()
+    if isinstance(options, PolicyOptions):
+        return options
+    imagination = options.get("imagination")
+    if isinstance(imagination, dict):
+        imagination = ImaginationOptions(**imagination)
+    return PolicyOptions(**{**options, "hidden": tuple(options["hidden"]), "imagination": imagination})

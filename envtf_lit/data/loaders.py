@@ -1,0 +1,196 @@
+"""Batches for Lightning: the dataset lives on the device as tensors, and a batch is a draw of row numbers.
+
+Every epoch draws from a generator seeded by (seed, epoch), so a run resumed at an epoch's start sees the same rows as
+one that was never interrupted.
+"""
+
+from collections.abc import Iterator
+
+import lightning as L
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.formats import load_dataset
+
+
+def epoch_generator(seed: int, epoch: int, stream: str) -> torch.Generator:
+    """An independent random stream for each (seed, epoch, purpose)."""
+    words = np.random.SeedSequence([seed, epoch, *stream.encode()]).generate_state(2, np.uint32)
+    return torch.Generator().manual_seed(int(words[0]) << 32 | int(words[1]))
+
+
+class DrawSampler(Sampler[Tensor]):
+    """Yields `batches` tensors of uniform draws from [0, rows), of shape `shape`, anew in each epoch."""
+
+    def __init__(self, rows: int, shape: tuple[int, ...], batches: int, *, seed: int) -> None:
+        self.rows, self.shape, self.batches, self.seed, self.epoch = rows, shape, batches, seed, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by Lightning before each epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.batches
+
+    def __iter__(self) -> Iterator[Tensor]:
+        generator = epoch_generator(self.seed, self.epoch, "rows")
+        for _ in range(self.batches):
+            yield torch.randint(self.rows, self.shape, generator=generator)
+
+
+class Windows(Dataset[dict[str, Tensor]]):
+    """Windows of up to T consecutive steps that never cross an episode.
+
+    Indexed by a tensor of B window numbers. An episode of L steps has L + T - 1 windows, those that overlap it by at
+    least one step, so that each row is seen equally often: the first token of a rollout must be learned too. What
+    sticks out on either side is cut, and the rest is moved to the left and padded on the right.
+    """
+
+    def __init__(self, dataset: OfflineDataset, length: int) -> None:
+        self.length = length
+        self.columns = {
+            name: torch.as_tensor(getattr(dataset, name))
+            for name in ("observations", "actions", "rewards", "next_observations")
+        }
+        self.starts = torch.as_tensor(dataset.episode_starts)  # (E,)
+        self.ends = torch.as_tensor(dataset.episode_ends)
+        self.offsets = torch.cumsum(self.ends - self.starts + length - 1, 0)  # (E,) windows up to each episode's last
+
+    def __len__(self) -> int:
+        return int(self.offsets[-1])
+
+    def __getitem__(self, windows: Tensor) -> dict[str, Tensor]:
+        episode = torch.searchsorted(self.offsets, windows, right=True)
+        begin = self.ends[episode] - (self.offsets[episode] - windows)  # may lie before the episode
+        start = torch.maximum(begin, self.starts[episode])
+        end = torch.minimum(begin + self.length, self.ends[episode])
+        index = start[:, None] + torch.arange(self.length)  # (B, T)
+        mask = index < end[:, None]
+        index = torch.minimum(index, end[:, None] - 1)
+        return {name: column[index] for name, column in self.columns.items()} | {"mask": mask.float()}
+
+    def tiles(self) -> Tensor:
+        """Window numbers that cover each row exactly once: consecutive windows of every episode."""
+        lengths = self.ends - self.starts
+        count = (lengths + self.length - 1) // self.length  # (E,)
+        episode = torch.repeat_interleave(torch.arange(len(lengths)), count)
+        position = torch.arange(len(episode)) - torch.repeat_interleave(count.cumsum(0) - count, count)
+        return (self.offsets - lengths)[episode] + position * self.length
+
+
+class Transitions(Dataset[dict[str, Tensor]]):
+    """Transitions of n steps with their Monte-Carlo return to go, indexed by a tensor of rows of any shape.
+
+    Columns: `observations`, `actions`, `rewards` (discounted sum over the n steps, or as many as the episode has
+    left), `next_observations` (where those steps end), `discounts` (`discount ** steps`, zero if the task terminated
+    there: what the value of `next_observations` counts for), `returns`.
+    """
+
+    def __init__(self, dataset: OfflineDataset, *, discount: float, n_step: int = 1) -> None:
+        last = np.repeat(dataset.episode_ends, dataset.episode_lengths) - 1  # (N,) last row of each row's episode
+        rows = np.arange(len(dataset))
+        end = np.minimum(rows + n_step - 1, last)
+        rewards = np.zeros(len(dataset))
+        for k in range(n_step):
+            rewards += np.where(rows + k <= end, discount**k * dataset.rewards[np.minimum(rows + k, last)], 0.0)
+        discounts = discount ** (end - rows + 1.0) * ~dataset.terminated[end]
+        self.columns = dict(
+            observations=torch.as_tensor(dataset.observations),
+            actions=torch.as_tensor(dataset.actions),
+            rewards=torch.as_tensor(rewards).float(),
+            next_observations=torch.as_tensor(dataset.next_observations[end]),
+            discounts=torch.as_tensor(discounts).float(),
+            returns=torch.as_tensor(dataset.returns_to_go(discount)),
+        )
+
+    def __len__(self) -> int:
+        return len(self.columns["rewards"])
+
+    def __getitem__(self, rows: Tensor) -> dict[str, Tensor]:
+        return {name: column[rows] for name, column in self.columns.items()}
+
+
+class WindowData(L.LightningDataModule):
+    """Windows for world models, with whole episodes held out for validation.
+
+    Args:
+        path: dataset file, HDF5 or NPZ.
+        context: steps per window; the model's context.
+        batch_size: windows per batch.
+        updates_per_epoch: batches per epoch.
+        held_out: share of the episodes kept for validation.
+        seed: of the split and of all draws.
+    """
+
+    train: OfflineDataset
+    held_out: OfflineDataset
+
+    def __init__(
+        self,
+        path: str,
+        context: int = 32,
+        batch_size: int = 32,
+        updates_per_epoch: int = 1_000,
+        held_out: float = 0.1,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.path, self.context, self.batch_size = path, context, batch_size
+        self.updates_per_epoch, self.share, self.seed = updates_per_epoch, held_out, seed
+        self.dataset = load_dataset(path)
+        self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
+
+    def setup(self, stage: str) -> None:
+        """Splits the dataset; called by Lightning."""
+        self.train, self.held_out = self.dataset.split(self.share, seed=self.seed)
+
+    def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
+        """Batches (B, T, …) of `Windows`."""
+        windows = Windows(self.train, self.context)
+        sampler = DrawSampler(len(windows), (self.batch_size,), self.updates_per_epoch, seed=self.seed)
+        return DataLoader(windows, sampler=sampler, batch_size=None)
+
+    def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:
+        """Each held-out row once."""
+        windows = Windows(self.held_out, self.context)
+        return DataLoader(windows, sampler=list(windows.tiles().split(256)), batch_size=None)  # pyright: ignore[reportArgumentType]
+
+
+class TransitionData(L.LightningDataModule):
+    """Transitions for agents, several batches at a time.
+
+    Args:
+        path: dataset file, HDF5 or NPZ.
+        batch_size: rows per gradient step.
+        updates_per_step: gradient steps per Lightning training step; a batch has shape (updates_per_step, batch_size).
+        steps_per_epoch: Lightning training steps per epoch.
+        discount: of future rewards, per step.
+        n_step: steps whose rewards enter the temporal-difference target.
+        seed: of all draws.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        batch_size: int = 256,
+        updates_per_step: int = 10,
+        steps_per_epoch: int = 50,
+        discount: float = 0.99,
+        n_step: int = 1,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.batch_size, self.updates_per_step, self.steps_per_epoch = batch_size, updates_per_step, steps_per_epoch
+        self.discount, self.n_step, self.seed = discount, n_step, seed
+        self.dataset = load_dataset(path)
+        self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
+
+    def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
+        """Batches (updates_per_step, batch_size, …) of `Transitions`."""
+        transitions = Transitions(self.dataset, discount=self.discount, n_step=self.n_step)
+        shape = (self.updates_per_step, self.batch_size)
+        sampler = DrawSampler(len(transitions), shape, self.steps_per_epoch, seed=self.seed)
+        return DataLoader(transitions, sampler=sampler, batch_size=None)

@@ -1,0 +1,195 @@
+"""Branched rollouts: from real states, under a policy, through any world model, until the robot falls."""
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import h5py
+import torch
+from torch import Tensor
+
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.errors import UserError
+from envtf_lit.policy import Policy, TanhGaussianActor
+from envtf_lit.storage import replacing
+from envtf_lit.world_models.interface import Mode, WorldModel
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """M imagined transitions, ordered by step and then by branch.
+
+    Attributes:
+        observations, next_observations: (M, S).
+        actions: (M, A).
+        rewards: (M,), without any penalty.
+        terminated: (M,) bool, by the robot's rule.
+        aleatoric: (M, S + 1) predicted standard deviation of (next observation, reward).
+        uncertainty: (M,) `Prediction.uncertainty` of each transition.
+        branch: (M,) which rollout; step: (M,) how many imagined steps came before.
+    """
+
+    observations: Tensor
+    actions: Tensor
+    rewards: Tensor
+    next_observations: Tensor
+    terminated: Tensor
+    aleatoric: Tensor
+    uncertainty: Tensor
+    branch: Tensor
+    step: Tensor
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    def returns(self, rewards: Tensor, discount: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Multi-step transitions that run from each imagined step to the end of its rollout.
+
+        Args:
+            rewards: (M,), `self.rewards` with whatever penalty.
+            discount: per step.
+
+        Returns:
+            (M,) discounted sum of rewards; (M, S) where the rollout ends; (M,) what the value there counts for:
+            `discount ** steps`, or zero if the robot fell.
+        """
+        total, weight, end = rewards.clone(), discount * (~self.terminated).float(), self.next_observations.clone()
+        latest = torch.full((int(self.branch.max()) + 1,), -1, device=self.branch.device)
+        for step in range(int(self.step.max()), -1, -1):
+            rows = (self.step == step).nonzero()[:, 0]
+            following = latest[self.branch[rows]]  # the same rollout's next step
+            rows, following = rows[following >= 0], following[following >= 0]
+            total[rows] += discount * total[following]
+            weight[rows] = discount * weight[following]
+            end[rows] = end[following]
+            rows = (self.step == step).nonzero()[:, 0]
+            latest[self.branch[rows]] = rows
+        return total, end, weight
+
+
+class BranchPoints:
+    """Real states to branch from, with the real steps that led to them."""
+
+    def __init__(self, dataset: OfflineDataset, device: torch.device | str = "cpu") -> None:
+        self.observations = torch.as_tensor(dataset.observations, device=device)
+        self.actions = torch.as_tensor(dataset.actions, device=device)
+        self.starts = torch.as_tensor(dataset.episode_starts[dataset.episode_index], device=device)
+
+    def draw(self, count: int, history: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Uniform rows, each with up to `history` steps before it: the arguments of `WorldModel.init`."""
+        device = self.starts.device
+        row = torch.randint(len(self.starts), (count,), generator=generator, device=device)
+        start = torch.maximum(row - history, self.starts[row])
+        index = torch.minimum(start[:, None] + torch.arange(history + 1, device=device), row[:, None])  # (B, history + 1)
+        return self.observations[index], self.actions[index[:, :-1]], row - start + 1
+
+
+class NoisyPolicy:
+    """A policy's sampled actions with Gaussian noise of a `scale` in units of half the action range, clipped to it."""
+
+    def __init__(self, actor: TanhGaussianActor, scale: float) -> None:
+        self.actor, self.scale = actor, scale
+
+    def act(
+        self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Observations (B, S) to actions (B, A)."""
+        action = self.actor.act(observation, deterministic, generator)
+        noise = torch.randn(action.shape, generator=generator, device=action.device)
+        half_range = 0.5 * (self.actor.action_high - self.actor.action_low)
+        return (action + self.scale * half_range * noise).clamp(self.actor.action_low, self.actor.action_high)
+
+
+@torch.no_grad()
+def imagine(
+    model: WorldModel,
+    policy: Policy,
+    starts: tuple[Tensor, Tensor, Tensor],
+    *,
+    horizon: int,
+    terminated: Callable[[Tensor], Tensor],
+    mode: Mode = "sample",
+    generator: torch.Generator | None = None,
+    batch_size: int = 4_096,
+) -> Rollouts:
+    """Rolls the policy's own (sampled) actions out through the model, at most `horizon` steps from each start.
+
+    Rollouts that ended leave the batch, so that no work is spent on them.
+
+    Args:
+        model: any world model; `starts` are the arguments of its `init`.
+        policy: acts on (B, S).
+        terminated: the robot's rule, next observations (B, S) to bool (B,).
+        mode: of `WorldModel.step`.
+        generator: of the actions and of sampled next states.
+        batch_size: rollouts imagined at a time.
+    """
+    parts: list[Rollouts] = []
+    for begin in range(0, len(starts[0]), batch_size):
+        chunk = tuple(part[begin : begin + batch_size] for part in starts)
+        state = model.init(*chunk)
+        branch = torch.arange(begin, begin + len(chunk[0]), device=chunk[0].device)
+        for step in range(horizon):
+            part, state = _advance(model, policy, state, branch, step, terminated, mode, generator)
+            parts.append(part)
+            alive = (~part.terminated).nonzero()[:, 0]
+            if len(alive) == 0:
+                break
+            if len(alive) < len(branch):
+                state, branch = model.gather(state, alive), branch[alive]
+    return Rollouts(**{field.name: torch.cat([getattr(p, field.name) for p in parts]) for field in fields(Rollouts)})
+
+
+def _advance(
+    model: WorldModel,
+    policy: Policy,
+    state: Any,
+    branch: Tensor,
+    step: int,
+    terminated: Callable[[Tensor], Tensor],
+    mode: Mode,
+    generator: torch.Generator | None,
+) -> tuple[Rollouts, Any]:
+    """One step of all rollouts that are still alive."""
+    observation = model.current(state)
+    action = policy.act(observation, deterministic=False, generator=generator)
+    state, prediction = model.step(state, action, mode=mode, generator=generator)
+    part = Rollouts(
+        observations=observation,
+        actions=action,
+        rewards=prediction.reward,
+        next_observations=prediction.observation,
+        terminated=terminated(prediction.observation),
+        aleatoric=prediction.aleatoric,
+        uncertainty=prediction.uncertainty,
+        branch=branch,
+        step=torch.full_like(branch, step),
+    )
+    return part, state
+
+
+def save_rollouts(rollouts: Rollouts, path: str | Path, *, provenance: dict[str, Any]) -> None:
+    """Writes all columns as HDF5, with `provenance` as a JSON attribute; equal rollouts give equal bytes."""
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for name, column in vars(rollouts).items():
+            file.create_dataset(name, data=column.cpu().numpy(), track_times=False)
+        file.attrs["provenance"] = json.dumps(provenance, sort_keys=True)
+    with replacing(path) as temporary:
+        temporary.write_bytes(buffer.getvalue())
+
+
+def load_rollouts(path: str | Path) -> Rollouts:
+    """Reads what `save_rollouts` wrote.
+
+    Raises:
+        UserError: the file is missing, damaged, or lacks a column.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            return Rollouts(**{field.name: torch.as_tensor(file[field.name][()]) for field in fields(Rollouts)})  # pyright: ignore[reportIndexIssue]
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{path} holds no imagined rollouts ({error}): run `envtf generate_rollouts`.") from None

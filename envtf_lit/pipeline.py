@@ -1,0 +1,229 @@
+"""One function per stage: the command line, DVC, the notebooks and the tests call the same ones.
+
+Each reads what the stages before it wrote below `root`, writes its own outputs there, and returns its metrics.
+"""
+
+import contextlib
+import json
+import resource
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+
+from envtf_lit.params import Params, PolicyOptions
+from envtf_lit.storage import pick_device, read_json, replacing, write_json
+from envtf_lit.tasks import Robot, get_task
+
+DATASET, CARD = Path("data/dataset.h5"), Path("data/dataset.json")
+WORLD_MODEL, BEHAVIOUR = Path("models/world_model"), Path("models/behaviour")
+ROLLOUTS, POLICIES = Path("data/rollouts.h5"), Path("models/policy")
+REPORTS, METRICS = Path("reports"), Path("reports/metrics.json")
+ALGORITHMS = ("cql", "et_cql")
+
+
+def download(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
+    """Makes or reads the dataset: `data/dataset.h5` and its card, which is returned."""
+    from envtf_lit.data.formats import save_dataset
+    from envtf_lit.data.sources import dataset_card, make_dataset
+
+    with _stage("download", params, root):
+        dataset = make_dataset(
+            get_task(params.task), params.download, seed=params.seed, workers=params.threads, progress=progress
+        )
+        save_dataset(dataset, root / DATASET)
+        card = dataset_card(dataset, params.download, params.seed)
+        write_json(root / CARD, card)
+    return card
+
+
+def train_model(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
+    """Trains the world model and keeps the weights of least held-out open-loop error: `models/world_model/`."""
+    from envtf_lit.data.loaders import WindowData
+    from envtf_lit.training import fit, run_folder
+    from envtf_lit.world_models.lit import LitWorldModel
+    from envtf_lit.world_models.store import save_world_model
+
+    options = params.train_model
+    with _stage("train_model", params, root):
+        data = WindowData(
+            str(root / DATASET),
+            context=options.model.context,
+            batch_size=options.batch_size,
+            updates_per_epoch=options.updates_per_epoch,
+            held_out=options.held_out,
+            seed=params.seed,
+        )
+        lit = LitWorldModel(data.observation_dim, data.action_dim, options, seed=params.seed)
+        key = _key(params, asdict(options))
+        curves = fit(
+            lit,
+            data,
+            run=run_folder(root, "train_model", key, [root / DATASET]),
+            epochs=options.updates // options.updates_per_epoch,
+            precision=params.precision,
+            progress=progress,
+            monitor="val/open_loop_error",
+            gradient_clip=options.gradient_clip,
+        )
+        best = min(curves.rows, key=lambda row: row["val/open_loop_error"])
+        metrics = {
+            "parameters": sum(p.numel() for p in lit.model.parameters()),
+            "epoch": int(best["epoch"]),
+            "open_loop_error": best["val/open_loop_error"],
+            "val_loss": best["val/loss"],
+        }
+        with replacing(root / WORLD_MODEL) as folder:
+            save_world_model(folder, lit.model)
+            _record(folder, metrics, key)
+            curves.write(folder / "curves.csv")
+    return metrics
+
+
+def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
+    """Clones the behaviour policy and lets it act in the world model: `models/behaviour/`, `data/rollouts.h5`."""
+    from envtf_lit.agents.bc import clone_behaviour
+    from envtf_lit.data.formats import load_dataset
+    from envtf_lit.imagination import BranchPoints, NoisyPolicy, imagine, save_rollouts
+    from envtf_lit.policy import save_policy
+    from envtf_lit.training import autocast, run_folder
+    from envtf_lit.world_models.store import load_world_model
+
+    options = params.generate_rollouts
+    with _stage("generate_rollouts", params, root):
+        key = _key(params, asdict(options))
+        dataset = load_dataset(root / DATASET)
+        run = run_folder(root, "generate_rollouts", key, [root / DATASET])
+        clone, curves = clone_behaviour(
+            root / DATASET, options, seed=params.seed, run=run, precision=params.precision, progress=progress
+        )
+        with replacing(root / BEHAVIOUR) as folder:
+            save_policy(folder, clone)
+            curves.write(folder / "curves.csv")
+        device = pick_device()
+        model = load_world_model(root / WORLD_MODEL).to(device)
+        generator = torch.Generator(device).manual_seed(params.seed)
+        starts = BranchPoints(dataset, device).draw(options.branches, options.history, generator)
+        begin = time.perf_counter()
+        with autocast(device, params.precision):
+            rollouts = imagine(
+                model,
+                NoisyPolicy(clone.to(device), options.exploration),
+                starts,
+                horizon=options.horizon,
+                terminated=_robot(params).terminated,
+                mode=options.mode,
+                generator=generator,
+            )
+        rate = len(rollouts) / (time.perf_counter() - begin)
+        metrics = {
+            "transitions": len(rollouts),
+            "terminated": int(rollouts.terminated.sum()),
+            "uncertainty_mean": float(rollouts.uncertainty.mean()),
+        }
+        save_rollouts(rollouts, root / ROLLOUTS, provenance=key | {"task": params.task})
+        _note_timing(root, "imagined_transitions_per_second", rate)
+    return metrics
+
+
+def train_policy(
+    params: Params, root: Path = Path("."), *, algorithm: str = "et_cql", progress: bool = True
+) -> dict[str, Any]:
+    """Trains `cql` (data alone) or `et_cql` (data and imagination): `models/policy/<algorithm>/`."""
+    from envtf_lit.agents.cql import CQL
+    from envtf_lit.data.loaders import TransitionData
+    from envtf_lit.policy import save_policy
+    from envtf_lit.training import fit, observation_scale, run_folder
+
+    options: PolicyOptions = getattr(params.train_policy, algorithm)
+    with _stage(f"train_policy_{algorithm}", params, root):
+        data = TransitionData(
+            str(root / DATASET),
+            batch_size=options.batch_size,
+            updates_per_step=options.updates_per_step,
+            steps_per_epoch=options.updates_per_epoch // options.updates_per_step,
+            discount=options.discount,
+            n_step=options.n_step,
+            seed=params.seed,
+        )
+        dataset = data.dataset
+        agent = CQL(
+            data.observation_dim,
+            data.action_dim,
+            options,
+            action_low=dataset.action_low.tolist(),
+            action_high=dataset.action_high.tolist(),
+            seed=params.seed,
+        )
+        agent.normalise_with(*observation_scale(torch.as_tensor(dataset.observations)))
+        inputs = [root / DATASET]
+        if options.imagination is not None:
+            _give_imagination(agent, params, root, dataset)
+            inputs += [root / WORLD_MODEL, root / ROLLOUTS]
+        key = _key(params, asdict(options))
+        curves = fit(
+            agent,
+            data,
+            run=run_folder(root, f"train_policy_{algorithm}", key, inputs),
+            epochs=options.updates // options.updates_per_epoch,
+            precision=params.precision,
+            progress=progress,
+        )
+        metrics = {name.removeprefix("train/"): value for name, value in curves.rows[-1].items()}
+        with replacing(root / POLICIES / algorithm) as folder:
+            save_policy(folder, agent.average_actor)
+            _record(folder, metrics, key)
+            curves.write(folder / "curves.csv")
+    return metrics
+
+
+def _give_imagination(agent: Any, params: Params, root: Path, dataset: Any) -> None:
+    """Hands an agent the world model and the stored rollouts."""
+    from envtf_lit.imagination import BranchPoints, load_rollouts
+    from envtf_lit.world_models.store import load_world_model
+
+    device = pick_device()
+    agent.reward_std = float(dataset.rewards.std())
+    agent.dream_with(
+        load_world_model(root / WORLD_MODEL).to(device),
+        BranchPoints(dataset, device),
+        _robot(params).terminated,
+        load_rollouts(root / ROLLOUTS),
+    )
+
+
+def _robot(params: Params) -> Robot:
+    return get_task(params.task).robot
+
+
+def _key(params: Params, options: dict[str, Any]) -> dict[str, Any]:
+    """What a run's result depends on, beside its input files."""
+    return {"seed": params.seed, "threads": params.threads, "precision": params.precision, "options": options}
+
+
+def _record(folder: Path, metrics: dict[str, Any], key: dict[str, Any]) -> None:
+    """Metrics and resolved options beside the weights."""
+    write_json(folder / "metrics.json", metrics)
+    write_json(folder / "resolved.json", key)
+
+
+@contextlib.contextmanager
+def _stage(name: str, params: Params, root: Path) -> Iterator[None]:
+    """Threads and seeds for a stage; its wall time and peak memory go to a side file that no hash covers."""
+    torch.set_num_threads(params.threads)
+    L.seed_everything(params.seed, verbose=False)
+    begin = time.perf_counter()
+    yield
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    _note_timing(root, name, {"seconds": round(time.perf_counter() - begin, 1), "peak_memory_mb": round(peak)})
+
+
+def _note_timing(root: Path, name: str, value: Any) -> None:
+    path = root / ".envtf" / "timings.json"
+    with contextlib.suppress(ValueError):  # a damaged side file is begun anew
+        timings = read_json(path) if path.exists() else {}
+        write_json(path, timings | {name: value})

@@ -1,0 +1,121 @@
+"""One way to train a LightningModule: resumable, quiet or with a progress bar, and leaving nothing half-written."""
+
+import csv
+import hashlib
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
+from torch import Tensor
+
+from envtf_lit.params import Precision
+from envtf_lit.storage import replacing
+
+RUNS = Path(".envtf/runs")
+
+
+def run_folder(root: Path, stage: str, parameters: Any, inputs: Sequence[Path]) -> Path:
+    """Where a run's resumable checkpoints live: named by its parameters and its inputs' bytes.
+
+    A run that was killed finds its own checkpoint again; one with other parameters or data starts afresh.
+    """
+    digest = hashlib.blake2b(json.dumps(parameters, sort_keys=True, default=str).encode(), digest_size=8)
+    for path in inputs:
+        files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+        for file in files:
+            with file.open("rb") as stream:
+                digest.update(hashlib.file_digest(stream, "blake2b").digest())
+    return root / RUNS / f"{stage}-{digest.hexdigest()}"
+
+
+class Curves(Checkpoint):
+    """Keeps one row of logged metrics per epoch, in the checkpoint too, so that a resumed run's curves are whole.
+
+    A `Checkpoint` by type alone: Lightning calls those after the module, whose own epoch-end metrics belong in the row.
+    """
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, float]] = []
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        values = {name: float(value) for name, value in sorted(trainer.callback_metrics.items())}
+        self.rows.append({"epoch": trainer.current_epoch + 1, **values})
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"rows": self.rows}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.rows = state_dict["rows"]
+
+    def write(self, path: Path) -> None:
+        """Writes the rows as CSV; a metric that an epoch did not log is left empty."""
+        names = dict.fromkeys(name for row in self.rows for name in row)
+        with replacing(path) as temporary, temporary.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, names)
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+
+def fit(
+    module: L.LightningModule,
+    data: L.LightningDataModule,
+    *,
+    run: Path,
+    epochs: int,
+    precision: Precision,
+    progress: bool = True,
+    monitor: str | None = None,
+    gradient_clip: float | None = None,
+) -> Curves:
+    """Trains for `epochs`, resuming from `run` if a checkpoint lies there; leaves the module as it should be kept.
+
+    Args:
+        module: holds its final weights afterwards, or with `monitor` those of the epoch where it was lowest.
+        run: folder of the resumable checkpoints, removed at the end.
+        monitor: logged name to select the kept weights by.
+        gradient_clip: largest gradient norm, for automatic optimisation alone.
+    """
+    curves, last = Curves(), ModelCheckpoint(dirpath=run, filename="last", enable_version_counter=False)
+    callbacks: list[Callback] = [curves, last]
+    if monitor is not None:
+        best = ModelCheckpoint(dirpath=run, filename="best", monitor=monitor, enable_version_counter=False)
+        callbacks.append(best)
+    if progress:
+        callbacks.append(RichProgressBar())
+    trainer = L.Trainer(
+        max_epochs=epochs,
+        precision="bf16-mixed" if precision == "bf16" else "32-true",
+        accelerator="auto",
+        devices=1,
+        callbacks=callbacks,
+        logger=False,
+        enable_progress_bar=progress,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        gradient_clip_val=gradient_clip,
+    )
+    checkpoint = run / "last.ckpt"
+    trainer.fit(module, datamodule=data, ckpt_path=str(checkpoint) if checkpoint.exists() else None, weights_only=True)
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    if monitor is not None:
+        kept = torch.load(run / "best.ckpt", map_location="cpu", weights_only=True)
+        module.load_state_dict(kept["state_dict"])
+    shutil.rmtree(run, ignore_errors=True)
+    return curves
+
+
+def autocast(device: torch.device, precision: Precision) -> torch.autocast:
+    """bf16 matrix products where the parameters ask for them."""
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
+
+
+def observation_scale(observations: Tensor, floor: float = 1e-3) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation (S,) of observations (N, S) for a policy's inputs; the std is at least `floor`."""
+    std, mean = torch.std_mean(observations.double(), dim=0, correction=0)
+    return mean.float(), std.clamp(min=floor).float()

@@ -1,0 +1,70 @@
+"""The scales between the data's units and the network's: buffers of the model, so that they are saved with it."""
+
+import torch
+from torch import Tensor, nn
+
+from envtf_lit.data.dataset import OfflineDataset
+
+CONSTANT = 1e-6  # a dimension whose standard deviation is below this is constant: not live
+
+
+class Normaliser(nn.Module):
+    """Z-scores of observations, actions and targets.
+
+    Targets are (S + 1): the state's change (`delta`) or the next state (`absolute`), then the reward, each over its own
+    standard deviation. Constant dimensions keep scale 1 and are marked as not live.
+    """
+
+    observation_mean: Tensor
+    observation_std: Tensor
+    action_mean: Tensor
+    action_std: Tensor
+    target_mean: Tensor
+    target_std: Tensor
+    live: Tensor
+
+    def __init__(self, observation_dim: int, action_dim: int, *, delta: bool) -> None:
+        super().__init__()
+        self.delta = delta
+        for name, size in (("observation", observation_dim), ("action", action_dim), ("target", observation_dim + 1)):
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+        self.register_buffer("live", torch.ones(observation_dim, dtype=torch.bool))
+
+    def fit(self, dataset: OfflineDataset) -> None:
+        """Takes means and standard deviations from the training rows."""
+        observations = torch.as_tensor(dataset.observations)
+        following = torch.as_tensor(dataset.next_observations)
+        target = torch.cat(
+            [following - observations if self.delta else following, torch.as_tensor(dataset.rewards)[:, None]], dim=-1
+        )
+        for name, rows in (
+            ("observation", observations), ("action", torch.as_tensor(dataset.actions)), ("target", target)
+        ):  # fmt: skip
+            std, mean = torch.std_mean(rows.double(), dim=0, correction=0)
+            getattr(self, f"{name}_mean").copy_(mean)
+            getattr(self, f"{name}_std").copy_(torch.where(std < CONSTANT, 1.0, std))
+            if name == "observation":
+                self.live.copy_(std >= CONSTANT)
+
+    def token(self, observation: Tensor, action: Tensor) -> Tensor:
+        """(..., S) and (..., A) to the network's input (..., S + A)."""
+        return torch.cat(
+            [
+                (observation - self.observation_mean) / self.observation_std,
+                (action - self.action_mean) / self.action_std,
+            ],
+            dim=-1,
+        )
+
+    def target(self, observation: Tensor, next_observation: Tensor, reward: Tensor) -> Tensor:
+        """What the network should predict: (..., S), (..., S), (...) to (..., S + 1)."""
+        change = next_observation - observation if self.delta else next_observation
+        return (torch.cat([change, reward.unsqueeze(-1)], dim=-1) - self.target_mean) / self.target_std
+
+    def outcome(self, observation: Tensor, target: Tensor) -> Tensor:
+        """The inverse of `target`: (..., S) and (..., S + 1) to next observation and reward (..., S + 1)."""
+        outcome = target * self.target_std + self.target_mean
+        if self.delta:
+            outcome = outcome + nn.functional.pad(observation, (0, 1))
+        return outcome

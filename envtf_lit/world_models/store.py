@@ -1,0 +1,25 @@
+"""World models on disk, through a closed registry: no class is ever imported by a name found in a file."""
+
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from envtf_lit.storage import load_module, save_module
+from envtf_lit.world_models.transformer import EnvironmentTransformer
+
+WORLD_MODELS: dict[str, type[nn.Module]] = {"environment_transformer": EnvironmentTransformer}
+
+
+def save_world_model(folder: str | Path, model: EnvironmentTransformer) -> None:
+    """Writes `weights.safetensors` and `config.json`."""
+    save_module(folder, model, kind="environment_transformer", arguments=model.arguments)
+
+
+def load_world_model(folder: str | Path) -> Any:
+    """The world model saved in a folder, in eval mode; it follows `WorldModel`.
+
+    Raises:
+        UserError: the folder is missing, damaged, or holds something that is not a world model.
+    """
+    return load_module(folder, WORLD_MODELS).requires_grad_(False)

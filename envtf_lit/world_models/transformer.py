@@ -1,0 +1,311 @@
+"""The Environment Transformer: one causal transformer, one token per state-action pair.
+
+Reads `x_t = [s_t, a_t]`, predicts a diagonal Gaussian over `(s_{t+1}, r_t)` (paper, "Environment Modeling"). Positions
+are rotary and attention is a sliding window of `context` tokens in training and in generation alike, so cached
+generation equals the uncached forward pass at every step, past the context length too.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from envtf_lit.errors import UserError
+from envtf_lit.params import ModelOptions
+from envtf_lit.world_models.interface import Mode, Prediction
+from envtf_lit.world_models.normaliser import Normaliser
+from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
+
+LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -14.0, 4.0
+
+
+def rotate(x: Tensor, positions: Tensor) -> Tensor:
+    """Rotary position embedding (Su et al. 2021) of (..., T, d) at integer positions (T,)."""
+    half = x.shape[-1] // 2
+    frequency = 10_000.0 ** (-torch.arange(half, device=x.device, dtype=torch.float32) / half)
+    angle = positions.float()[:, None] * frequency  # (T, d/2)
+    cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
+    first, second = x[..., :half], x[..., half:]
+    return torch.cat([first * cos - second * sin, second * cos + first * sin], dim=-1)
+
+
+def window_mask(length: int, context: int, device: torch.device) -> Tensor:
+    """(T, T) bool: token i may look at tokens i - context + 1 … i."""
+    distance = torch.arange(length, device=device)[:, None] - torch.arange(length, device=device)
+    return (distance >= 0) & (distance < context)
+
+
+class Attention(nn.Module):
+    """Causal multi-head attention over a sliding window, for whole sequences and for one token at a time."""
+
+    def __init__(self, options: ModelOptions) -> None:
+        super().__init__()
+        self.heads, self.context, self.dropout = options.heads, options.context, options.dropout
+        self.qkv = nn.Linear(options.width, 3 * options.width)
+        self.out = nn.Linear(options.width, options.width)
+
+    def project(self, x: Tensor, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(B, T, D) to rotated queries and keys, and values, each (B, H, T, d)."""
+        B, T, D = x.shape
+        qkv = self.qkv(x).view(B, T, 3, self.heads, D // self.heads)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, T, d)
+        return rotate(q, positions), rotate(k, positions), v
+
+    def merge(self, y: Tensor) -> Tensor:
+        B, H, T, d = y.shape
+        return self.out(y.transpose(1, 2).reshape(B, T, H * d))  # (B, T, D)
+
+    def forward(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
+        """Whole sequences; `mask` None means plain causal attention."""
+        dropout = self.dropout if self.training else 0.0
+        y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=mask is None, dropout_p=dropout)
+        return self.merge(y)
+
+    def attend(self, q: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
+        """One query (B, H, 1, d) over cached keys and values (B, H, C, d), as two batched products."""
+        score = q @ keys.transpose(-2, -1) * q.shape[-1] ** -0.5  # (B, H, 1, C)
+        if mask is not None:
+            score = score.masked_fill(~mask[:, None, None, :], float("-inf"))
+        return self.merge(score.float().softmax(-1).to(values.dtype) @ values)
+
+
+class Block(nn.Module):
+    """A pre-norm transformer block."""
+
+    def __init__(self, options: ModelOptions) -> None:
+        super().__init__()
+        activation = {"relu": nn.ReLU, "gelu": nn.GELU}[options.activation]
+        self.attention_norm = nn.LayerNorm(options.width)
+        self.attention = Attention(options)
+        self.mlp_norm = nn.LayerNorm(options.width)
+        self.mlp = nn.Sequential(
+            nn.Linear(options.width, 4 * options.width), activation(), nn.Linear(4 * options.width, options.width)
+        )
+        self.dropout = nn.Dropout(options.dropout)
+
+    def finish(self, x: Tensor, attended: Tensor) -> Tensor:
+        """The residual sums of both branches, given what attention returned."""
+        x = x + self.dropout(attended)
+        return x + self.dropout(self.mlp(self.mlp_norm(x)))
+
+
+@dataclass(frozen=True)
+class TransformerState:
+    """A batch of rollouts under way: the ring cache, the clock, and the state that has no action yet.
+
+    Attributes:
+        cache: per layer, keys and values (B, H, C, d); token t lies in slot t mod C.
+        clock: position of the next token, the same for all rows (histories are right-aligned).
+        first: (B,) position of each row's first token, or None where all rows began at 0.
+        observation: (B, S) current observation.
+    """
+
+    cache: list[tuple[Tensor, Tensor]]
+    clock: int
+    first: Tensor | None
+    observation: Tensor
+
+
+class EnvironmentTransformer(nn.Module):
+    """Predicts next state and reward with aleatoric variance, from up to `context` past state-action pairs.
+
+    With `objective="paper_mse"` a third head holds the paper's learned epistemic variance; with a proper score no head
+    claims epistemic uncertainty, since a score of y sees only the sum of the two (`epistemic` is then None).
+
+    Raises:
+        UserError: `heads` does not divide `width` into even parts.
+    """
+
+    def __init__(self, observation_dim: int, action_dim: int, **options: Any) -> None:
+        super().__init__()
+        self.options = ModelOptions(**options)
+        width, heads = self.options.width, self.options.heads
+        if width % (2 * heads):
+            raise UserError(f"width {width} does not split into {heads} heads of even size: choose width = 2k * heads.")
+        self.observation_dim, self.action_dim = observation_dim, action_dim
+        self.has_epistemic_head = self.options.objective == "paper_mse"
+        self.normaliser = Normaliser(observation_dim, action_dim, delta=self.options.target == "delta")
+        self.embed = nn.Linear(observation_dim + action_dim, width)
+        self.blocks = nn.ModuleList(Block(self.options) for _ in range(self.options.layers))
+        self.norm = nn.LayerNorm(width)
+        self.head = nn.Linear(width, (3 if self.has_epistemic_head else 2) * (observation_dim + 1))
+        self.apply(_initialise)
+        for block in self.blocks:  # residual branches start small: sum of 2L terms keeps unit scale (GPT-2)
+            for linear in (block.attention.out, block.mlp[2]):
+                nn.init.normal_(linear.weight, std=0.02 * (2 * self.options.layers) ** -0.5)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What the constructor needs to build this module again."""
+        return dict(observation_dim=self.observation_dim, action_dim=self.action_dim, **asdict(self.options))
+
+    def forward(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Whole sequences (B, T, S) and (B, T, A) to mean, log-variance and epistemic log-variance, (B, T, S + 1).
+
+        All in the unit scale of `normaliser.target`. Rows of different length are padded on the right: no token sees
+        what comes after it.
+        """
+        hidden, _ = self.encode(observations, actions, cached=False)
+        return self.heads(hidden)
+
+    def encode(
+        self, observations: Tensor, actions: Tensor, *, cached: bool, first: Tensor | None = None
+    ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """Last hidden tokens (B, T, D) and, if `cached`, each layer's keys and values (B, H, T, d)."""
+        T = observations.shape[1]
+        positions = torch.arange(T, device=observations.device)
+        mask = None
+        if T > self.options.context or first is not None:
+            mask = window_mask(T, self.options.context, observations.device)
+        if first is not None:  # a row's padding on the left sees only itself, so that its softmax stays finite
+            seen = positions >= first[:, None]  # (B, T)
+            mask = (mask & seen[:, None, :] | torch.eye(T, dtype=torch.bool, device=positions.device))[:, None]
+        x = self.embed(self.normaliser.token(observations, actions))
+        cache = []
+        for block in self.blocks:
+            q, k, v = block.attention.project(block.attention_norm(x), positions)
+            if cached:
+                cache.append((k, v))
+            x = block.finish(x, block.attention(q, k, v, mask))
+        return self.norm(x), cache
+
+    def heads(self, hidden: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Hidden tokens (..., D) to mean, log-variance, epistemic log-variance or None, each (..., S + 1), in fp32."""
+        with torch.autocast(hidden.device.type, enabled=False):
+            mean, *log_variances = self.head(hidden.float()).chunk(3 if self.has_epistemic_head else 2, dim=-1)
+        bounded = [_bound(x) for x in log_variances]
+        return mean, bounded[0], bounded[1] if self.has_epistemic_head else None
+
+    def loss(self, batch: dict[str, Tensor], *, generator: torch.Generator | None = None) -> Tensor:
+        """Mean objective per valid token and output dimension of a batch of windows (see `data.loaders.Windows`)."""
+        mean, log_variance, epistemic = self(batch["observations"], batch["actions"])
+        target = self.normaliser.target(batch["observations"], batch["next_observations"], batch["rewards"])
+        if self.options.objective == "paper_mse":
+            assert epistemic is not None
+            loss = paper_mse(mean, log_variance, epistemic, target, generator=generator)
+        else:
+            loss = {"nll": nll, "beta_nll": beta_nll}[self.options.objective](mean, log_variance, target)
+        return (loss * batch["mask"]).sum() / (batch["mask"].sum() * target.shape[-1])
+
+    def init(self, observations: Tensor, actions: Tensor, lengths: Tensor) -> TransformerState:
+        """See `WorldModel.init`. One causal pass over the histories fills the cache."""
+        B, T, _ = observations.shape
+        current = observations[torch.arange(B, device=observations.device), lengths - 1]
+        context, H, d = self.options.context, self.options.heads, self.options.width // self.options.heads
+        empty = [(current.new_empty(B, H, context, d), current.new_empty(B, H, context, d)) for _ in self.blocks]
+        first = None
+        if T > 1:
+            shift = T - lengths  # right-align: the token before the current state gets position T - 2 in every row
+            index = (torch.arange(T - 1, device=shift.device) - shift[:, None]).clamp(min=0)[..., None]  # (B, T-1, 1)
+            past = torch.take_along_dim(observations, index, 1), torch.take_along_dim(actions, index, 1)
+            first = shift if bool((shift > 0).any()) else None
+            _, tokens = self.encode(*past, cached=True, first=first)
+            slots = torch.arange(max(0, T - 1 - context), T - 1, device=shift.device)
+            for (keys, values), (k, v) in zip(empty, tokens, strict=True):
+                keys[:, :, slots % context] = k[:, :, slots].float()
+                values[:, :, slots % context] = v[:, :, slots].float()
+        return TransformerState(empty, T - 1, first, current)
+
+    def step(
+        self,
+        state: TransformerState,
+        action: Tensor,
+        *,
+        mode: Mode = "mean",
+        generator: torch.Generator | None = None,
+    ) -> tuple[TransformerState, Prediction]:
+        """See `WorldModel.step`. One token per call; the cache is written in place unless gradients are needed."""
+        position = torch.tensor([state.clock], device=action.device)
+        x = self.embed(self.normaliser.token(state.observation, action))[:, None]  # (B, 1, D)
+        filled = min(state.clock + 1, self.options.context)
+        slot, mask = state.clock % self.options.context, self._visible(state, filled)
+        cache = []
+        for block, (keys, values) in zip(self.blocks, state.cache, strict=True):
+            q, k, v = block.attention.project(block.attention_norm(x), position)
+            keys, values = _write(keys, k, slot), _write(values, v, slot)
+            cache.append((keys, values))
+            q, keys, values = q.float(), keys[:, :, :filled], values[:, :, :filled]
+            x = block.finish(x, block.attention.attend(q, keys, values, mask))
+        prediction = self.predict(self.norm(x)[:, 0], state.observation, mode=mode, generator=generator)
+        return TransformerState(cache, state.clock + 1, state.first, prediction.observation), prediction
+
+    def _visible(self, state: TransformerState, filled: int) -> Tensor | None:
+        """(B, filled) slots that hold a token of the row itself, or None where all do."""
+        if state.first is None:
+            return None
+        slots = torch.arange(filled, device=state.first.device)
+        positions = state.clock - (state.clock - slots) % self.options.context
+        return positions >= state.first[:, None]
+
+    def predict(
+        self, hidden: Tensor, observation: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None
+    ) -> Prediction:
+        """Last hidden tokens (..., D) and current observations (..., S) to a `Prediction` in the data's units."""
+        scale = self.normaliser.target_std
+        mean, log_variance, epistemic_log_variance = self.heads(hidden)
+        variance = log_variance.exp()
+        if epistemic_log_variance is not None:
+            variance = variance + epistemic_log_variance.exp()
+        value = mean
+        if mode == "sample":
+            value = mean + variance.sqrt() * torch.randn(
+                mean.shape, generator=generator, device=mean.device, dtype=mean.dtype
+            )
+        outcome = self.normaliser.outcome(observation, value)
+        return Prediction(
+            observation=outcome[..., :-1],
+            reward=outcome[..., -1],
+            mean=self.normaliser.outcome(observation, mean),
+            aleatoric=torch.exp(0.5 * log_variance) * scale,
+            epistemic=None if epistemic_log_variance is None else torch.exp(0.5 * epistemic_log_variance) * scale,
+            uncertainty=self._uncertainty(variance),
+            log_prob=-nll(mean, variance.log(), value) - scale.log().sum(),
+        )
+
+    def _uncertainty(self, variance: Tensor) -> Tensor:
+        """`||sqrt(S_au + S_eu)||_2 / sqrt(S)` over live observation dimensions, z-scored by the data's own spread."""
+        ratio = self.normaliser.target_std[:-1] / self.normaliser.observation_std
+        live = self.normaliser.live.float()
+        scaled = variance[..., :-1] * ratio.square() * live
+        return (scaled.sum(-1) / live.sum().clamp(min=1)).sqrt()
+
+    def observe(self, state: TransformerState, observation: Tensor) -> TransformerState:
+        """See `WorldModel.observe`."""
+        return TransformerState(state.cache, state.clock, state.first, observation)
+
+    def current(self, state: TransformerState) -> Tensor:
+        """See `WorldModel.current`."""
+        return state.observation
+
+    def fork(self, state: TransformerState, n: int) -> TransformerState:
+        """See `WorldModel.fork`."""
+        index = torch.arange(len(state.observation), device=state.observation.device).repeat_interleave(n)
+        return self.gather(state, index)
+
+    def gather(self, state: TransformerState, index: Tensor) -> TransformerState:
+        """See `WorldModel.gather`."""
+        cache = [(keys[index], values[index]) for keys, values in state.cache]
+        first = None if state.first is None else state.first[index]
+        return TransformerState(cache, state.clock, first, state.observation[index])
+
+
+def _initialise(module: nn.Module) -> None:
+    if isinstance(module, nn.Linear):
+        nn.init.normal_(module.weight, std=0.02)
+        nn.init.zeros_(module.bias)
+
+
+def _bound(log_variance: Tensor) -> Tensor:
+    """Softly clamps to [LOG_VARIANCE_MIN, LOG_VARIANCE_MAX], with a gradient everywhere (Chua et al. 2018)."""
+    upper = LOG_VARIANCE_MAX - F.softplus(LOG_VARIANCE_MAX - log_variance)
+    return LOG_VARIANCE_MIN + F.softplus(upper - LOG_VARIANCE_MIN)
+
+
+def _write(cache: Tensor, token: Tensor, slot: int) -> Tensor:
+    """Puts (B, H, 1, d) into a slot of (B, H, C, d): in place, or into a copy when gradients flow through it."""
+    if torch.is_grad_enabled() and (token.requires_grad or cache.requires_grad):
+        cache = cache.clone()
+    cache[:, :, slot] = token[:, :, 0].to(cache.dtype)
+    return cache

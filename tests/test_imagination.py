@@ -1,0 +1,82 @@
+"""Branching, imagining, multi-step returns of imagined rollouts, and the file they are stored in."""
+
+import pytest
+import torch
+
+from envtf_lit.errors import UserError
+from envtf_lit.imagination import BranchPoints, NoisyPolicy, Rollouts, imagine, load_rollouts, save_rollouts
+from envtf_lit.policy import TanhGaussianActor
+from envtf_lit.world_models.transformer import EnvironmentTransformer
+from tests.test_loaders import make_dataset
+
+
+def make_rollouts(horizon=4, limit=0.4) -> Rollouts:
+    torch.manual_seed(0)
+    model, actor = EnvironmentTransformer(2, 1, layers=1, heads=1, width=8, context=8), TanhGaussianActor(2, 1)
+    torch.nn.init.normal_(model.head.weight, std=1.0)
+    generator = torch.Generator().manual_seed(0)
+    starts = BranchPoints(make_dataset()).draw(50, 2, generator)
+    fell = lambda observation: observation[:, 0] - observation[:, 1] > limit  # noqa: E731
+    return imagine(model, actor, starts, horizon=horizon, terminated=fell, generator=generator, batch_size=20)
+
+
+def test_histories_are_real_steps_of_the_same_episode():
+    generator = torch.Generator().manual_seed(0)
+    observations, actions, lengths = BranchPoints(make_dataset()).draw(200, 2, generator)
+    episode = torch.as_tensor(make_dataset().episode_index)
+    for row in range(200):
+        rows = observations[row, : lengths[row], 0].long()
+        assert (torch.diff(rows) == 1).all() and len(set(episode[rows].tolist())) == 1
+        assert (actions[row, : lengths[row] - 1, 0] == 100 + rows[:-1]).all()
+        start = int(torch.as_tensor(make_dataset().episode_starts)[episode[rows[-1]]])
+        assert lengths[row] == min(3, int(rows[-1]) - start + 1)
+
+
+def test_rollouts_are_chained_and_stop_where_the_robot_falls():
+    rollouts = make_rollouts()
+    assert 0 < rollouts.terminated.sum() < 50
+    for branch in range(50):
+        rows = (rollouts.branch == branch).nonzero()[:, 0]
+        assert rollouts.step[rows].tolist() == list(range(len(rows)))
+        assert torch.equal(rollouts.observations[rows[1:]], rollouts.next_observations[rows[:-1]])
+        assert not rollouts.terminated[rows[:-1]].any()
+        assert rollouts.terminated[rows[-1]] or len(rows) == 4
+
+
+def test_same_seed_same_rollouts():
+    first, second = make_rollouts(), make_rollouts()
+    assert all(torch.equal(a, b) for a, b in zip(vars(first).values(), vars(second).values(), strict=True))
+
+
+def test_multi_step_returns_against_a_plain_loop():
+    rollouts = make_rollouts()
+    total, end, weight = rollouts.returns(rollouts.rewards, 0.9)
+    for row in range(len(rollouts)):
+        rows = (rollouts.branch == rollouts.branch[row]) & (rollouts.step >= rollouts.step[row])
+        rewards = rollouts.rewards[rows]
+        last = rows.nonzero()[-1, 0]
+        expected = sum(0.9**k * float(reward) for k, reward in enumerate(rewards))
+        assert float(total[row]) == pytest.approx(expected, rel=1e-5)
+        assert float(weight[row]) == pytest.approx(0.0 if rollouts.terminated[last] else 0.9 ** len(rewards))
+        assert torch.equal(end[row], rollouts.next_observations[last])
+
+
+def test_noise_respects_the_action_range():
+    actor = TanhGaussianActor(2, 1, action_low=[0.0], action_high=[4.0])
+    action = NoisyPolicy(actor, 1.0).act(torch.randn(1000, 2), generator=torch.Generator().manual_seed(0))
+    assert action.min() == 0.0 and action.max() == 4.0
+
+
+def test_stored_rollouts_come_back_and_equal_rollouts_give_equal_bytes(tmp_path):
+    rollouts = make_rollouts()
+    for name in ("a.h5", "b.h5"):
+        save_rollouts(rollouts, tmp_path / name, provenance={"seed": 0})
+    loaded = load_rollouts(tmp_path / "a.h5")
+    assert all(torch.equal(a, b) for a, b in zip(vars(rollouts).values(), vars(loaded).values(), strict=True))
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_a_file_without_rollouts_is_refused(tmp_path):
+    (tmp_path / "rollouts.h5").write_bytes(b"no")
+    with pytest.raises(UserError, match="holds no imagined rollouts"):
+        load_rollouts(tmp_path / "rollouts.h5")

@@ -1,0 +1,78 @@
+"""Windows, n-step transitions, and draws that a resumed run repeats."""
+
+import numpy as np
+import pytest
+import torch
+
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.loaders import DrawSampler, Transitions, Windows, epoch_generator
+
+
+def make_dataset(lengths=(3, 1, 5), terminated=(True, False, True)) -> OfflineDataset:
+    """Row i holds i in every observation, 100 + i in its action and i in its reward."""
+    total = sum(lengths)
+    ends = np.cumsum(lengths) - 1
+    row = np.arange(total, dtype=np.float32)
+    flags = np.zeros(total, bool)
+    flags[ends] = terminated
+    truncated = np.zeros(total, bool)
+    truncated[ends] = ~np.array(terminated)
+    return OfflineDataset(
+        observations=np.stack([row, row], 1),
+        actions=100 + row[:, None],
+        rewards=row,
+        next_observations=np.stack([row, row], 1) + 1,
+        terminated=flags,
+        truncated=truncated,
+        episode_starts=np.concatenate([[0], ends[:-1] + 1]),
+        action_low=np.array([0.0], np.float32),
+        action_high=np.array([200.0], np.float32),
+    )
+
+
+def test_windows_stay_inside_episodes_and_show_every_row_equally_often():
+    windows = Windows(make_dataset(), 4)
+    batch = windows[torch.arange(len(windows))]
+    valid = batch["mask"].bool()
+    rows = batch["rewards"]
+    episode = torch.as_tensor(make_dataset().episode_index)[rows.long()]
+    assert all(len(set(e[m].tolist())) == 1 for e, m in zip(episode, valid, strict=True))
+    steps = torch.diff(rows, dim=1)[valid[:, 1:]]
+    assert (steps == 1).all()
+    seen = torch.bincount(rows[valid].long())
+    assert (seen == 4).all()
+
+
+def test_tiles_cover_each_row_once():
+    windows = Windows(make_dataset(), 4)
+    batch = windows[windows.tiles()]
+    assert sorted(batch["rewards"][batch["mask"].bool()].tolist()) == list(range(9))
+
+
+def test_one_step_transitions_tell_terminated_from_truncated():
+    columns = Transitions(make_dataset(), discount=0.5).columns
+    torch.testing.assert_close(columns["discounts"], torch.tensor([0.5, 0.5, 0.0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.0]))
+
+
+def test_n_step_transitions_against_hand_computed_sums():
+    columns = Transitions(make_dataset(), discount=0.5, n_step=3).columns
+    # row 0: 0 + 1/2 + 2/4, terminated there; row 3: one truncated step; row 4: 4 + 5/2 + 6/4, goes on from row 7's state
+    assert columns["rewards"][[0, 3, 4]].tolist() == [1.0, 3.0, 8.0]
+    assert columns["discounts"][[0, 3, 4]].tolist() == [0.0, 0.5, 0.125]
+    assert columns["next_observations"][[0, 3, 4], 0].tolist() == [3.0, 4.0, 7.0]
+
+
+def test_draws_depend_on_seed_and_epoch_alone():
+    sampler = DrawSampler(1000, (2, 3), 5, seed=0)
+    first = torch.stack(list(sampler))
+    assert first.shape == (5, 2, 3)
+    assert torch.equal(first, torch.stack(list(sampler)))
+    sampler.set_epoch(1)
+    assert not torch.equal(first, torch.stack(list(sampler)))
+
+
+@pytest.mark.parametrize("other", [(1, 0, "rows"), (0, 1, "rows"), (0, 0, "agent")])
+def test_streams_differ(other):
+    draw = lambda *key: torch.rand(4, generator=epoch_generator(*key))  # noqa: E731
+    assert torch.equal(draw(0, 0, "rows"), draw(0, 0, "rows"))
+    assert not torch.equal(draw(0, 0, "rows"), draw(*other))
