@@ -31,7 +31,7 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("threads", "layers", "heads", "width", "context", "updates", "updates_per_epoch"), _COUNT),
     **dict.fromkeys(("updates_per_step", "batch_size", "clone_updates", "clone_batch_size", "branches"), _COUNT),
     **dict.fromkeys(("horizon", "buffer_size", "hidden", "critics", "sampled_actions", "episodes"), _COUNT),
-    **dict.fromkeys(("trajectories",), _COUNT),
+    **dict.fromkeys(("trajectories", "n_step"), _COUNT),
     **dict.fromkeys(("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty"), _NOT_NEGATIVE),
     **dict.fromkeys(("cql_weight", "warm_start"), _NOT_NEGATIVE),
     **dict.fromkeys(("learning_rate", "actor_learning_rate", "critic_learning_rate"), _POSITIVE),

@@ -1,0 +1,29 @@
+"""One thread per test process: the suite runs side by side with xdist, and busy threads that outnumber cores crawl."""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MKL_NUM_THREADS", "1")
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from envtf_lit.config import params_yaml, preset_params
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The root of the checkout."""
+    return Path(__file__).parent.parent
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder with the tiny preset's params.yaml, and the current one."""
+    (tmp_path / "params.yaml").write_text(params_yaml(preset_params("tiny")))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
