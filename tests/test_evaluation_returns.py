@@ -57,7 +57,9 @@ def test_median_episode_is_the_one_of_median_return(actor):
     np.testing.assert_array_equal(median.observations[:, :5], median.positions[:, 1:].astype(np.float32))
 
 
-def test_time_limit_ends_an_episode():
+def test_time_limit_ends_an_episode(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo notes a deprecated attribute of this robot in MUJOCO_LOG.TXT, wherever it is
+
     class Still:
         def act(self, observation, deterministic=True, generator=None):
             return torch.zeros(len(observation), 6)

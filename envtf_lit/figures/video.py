@@ -116,6 +116,7 @@ def _render(robot: Robot, positions: np.ndarray, size: int, backend: str) -> np.
         subprocess.run(
             [sys.executable, "-m", "envtf_lit.figures.render", source, target],
             env=os.environ | {"MUJOCO_GL": backend},
+            cwd=folder,  # for MuJoCo's log
             check=True,
             capture_output=True,
             timeout=TIMEOUT,
