@@ -1,0 +1,5 @@
+"""`python -m envtf_lit` is `envtf`."""
+
+from envtf_lit.cli import main
+
+main()

@@ -1,0 +1,180 @@
+"""`envtf`: help, exit codes, one readable sentence, and the stages and Lightning's command lines behind it."""
+
+import json
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from envtf_lit.cli import LIGHTNING, STAGES, flags_to_overrides, main
+from envtf_lit.config import dump_params, load_params, params_yaml, preset_params
+from envtf_lit.data.formats import load_dataset
+from envtf_lit.errors import UserError
+
+COMMANDS = [*STAGES, "init", "params", "doctor"]
+
+
+def exit_status(arguments: list[str]) -> int:
+    """What `envtf` would leave to the shell."""
+    try:
+        main(arguments)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+@pytest.fixture(scope="module")
+def tiny_download(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project in which `envtf download` has run."""
+    folder = tmp_path_factory.mktemp("project")
+    (folder / "params.yaml").write_text(params_yaml(preset_params("tiny")))
+    command = [sys.executable, "-m", "envtf_lit", "download", "--quiet", "--download.transitions", "1000"]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    return folder
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    for section in STAGES.get(command, ("", []))[1]:
+        options = re.findall(rf"--{re.escape(section)}\.[\w.]+ +\(.+, default .+\)\n {{8}}\S", text)
+        assert len(options) >= 3, text
+
+
+def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert [command for command in [*COMMANDS, *LIGHTNING] if f"\n    {command}" not in text] == []
+
+
+def test_help_is_quick() -> None:
+    code = "import sys; from envtf_lit.cli import build_parser; build_parser(); assert 'torch' not in sys.modules"
+    begin = time.perf_counter()
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert time.perf_counter() - begin < 10.0  # 0.1 s on an idle machine
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["download", "--sed", "1"], "did you mean 'seed'?"),
+        (["download", "--seed"], "--seed needs a value"),
+        (["download", "seed=1"], "is not an option"),
+        (["download", "--params", "nowhere.yaml"], "nowhere.yaml does not exist"),
+        (["download", "--download.source=file", "--download.path=nowhere.h5"], "nowhere.h5"),
+        (["download", "--task", "hoper-medium-replay"], "did you mean 'hopper-medium-replay'?"),
+        (["train_model"], "data/dataset.h5"),
+        (["generate_rollouts"], "data/dataset.h5"),
+        (["train_policy", "cql"], "data/dataset.h5"),
+        (["evaluate"], "data/dataset.h5"),
+        (["params", "--preset", "smal"], "did you mean 'small'?"),
+        (["init", "here", "--preset", "smal"], "did you mean 'small'?"),
+    ],
+)
+def test_bad_input_ends_in_one_sentence(
+    arguments: list[str], sentence: str, project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_status(arguments) == 2
+    errors = capsys.readouterr().err.strip().splitlines()
+    assert sentence in errors[-1]
+    assert not any(line.startswith("Traceback") for line in errors)
+    assert [path.name for path in project.iterdir() if path.name not in ("params.yaml", ".envtf")] == []
+
+
+def test_unknown_commands_and_arguments_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(["downlod"]) == 2
+    assert exit_status(["doctor", "--fast"]) == 2
+    assert exit_status([]) == 2
+    assert "usage: envtf" in capsys.readouterr().err
+
+
+def test_an_interrupt_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(arguments: list[str]) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("envtf_lit.cli._run", interrupted)
+    assert exit_status(["train_model"]) == 130
+    assert "continues" in capsys.readouterr().err
+
+
+def test_flags_become_overrides() -> None:
+    assert flags_to_overrides(["--seed", "1", "--a.b=c=d", "--x", "-3"]) == ["seed=1", "a.b=c=d", "x=-3"]
+    with pytest.raises(UserError, match="needs a value"):
+        flags_to_overrides(["--seed"])
+
+
+def test_params_prints_what_init_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(["params", "--preset", "tiny"]) == 0
+    printed = capsys.readouterr().out
+    assert exit_status(["init", str(tmp_path / "new"), "--preset", "tiny"]) == 0
+    assert (tmp_path / "new" / "params.yaml").read_text() == printed
+    assert dump_params(load_params(tmp_path / "new" / "params.yaml")) == dump_params(preset_params("tiny"))
+
+
+def test_init_leaves_an_existing_project_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "dvc.yaml").write_text("mine")
+    assert exit_status(["init", str(tmp_path)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["dvc.yaml"]
+    assert (tmp_path / "dvc.yaml").read_text() == "mine"
+
+
+def test_doctor_reports_what_a_bug_report_needs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(["doctor"]) == 0
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert {"python", "torch", "mujoco", "cores", "device", "memory", "disk", "rendering"} <= lines.keys()
+    assert "missing" not in lines.values()
+
+
+def test_a_stage_writes_its_outputs_and_prints_its_metrics(tiny_download: Path) -> None:
+    dataset = load_dataset(tiny_download / "data" / "dataset.h5")
+    assert len(dataset) == 1000
+    assert json.loads((tiny_download / "data" / "dataset.json").read_text())["transitions"] == 1000
+
+
+@pytest.mark.parametrize("kind", LIGHTNING)
+def test_lightnings_help_says_that_a_config_is_trusted(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status([kind, "--help"]) == 0
+    assert "trusted like code" in " ".join(capsys.readouterr().out.split())
+
+
+def test_model_fit_takes_dimensions_from_the_data_and_resumes(tiny_download: Path) -> None:
+    fit = ["fit", "--data.path", "data/dataset.h5", "--trainer.logger=false", "--trainer.enable_progress_bar=false"]
+    sizes = {"model.layers": 1, "model.width": 16, "model.context": 4, "updates_per_epoch": 2, "updates": 4}
+    options = [f"--model.options.{key}={value}" for key, value in sizes.items()]
+    run(tiny_download, "model", *fit, *options)
+    (checkpoint,) = (tiny_download / ".envtf").rglob("*step=4.ckpt")
+    resumed = run(tiny_download, "model", *fit, *options, "--trainer.max_epochs=3", "--ckpt_path", str(checkpoint))
+    assert "Restored all states" in resumed
+    assert list((tiny_download / ".envtf").rglob("*step=6.ckpt"))
+
+
+def test_agent_fit_trains_on_a_log(tiny_download: Path) -> None:
+    sizes = {"updates": 4, "updates_per_epoch": 4, "updates_per_step": 2, "warm_start": 2, "hidden": [8]}
+    options = [f"--model.options.{key}={value}" for key, value in sizes.items()]
+    output = run(tiny_download, "agent", "fit", "--data.path", "data/dataset.h5", "--trainer.logger=false", *options)
+    assert "max_epochs=1` reached" in output
+
+
+def test_lightnings_command_lines_refuse_bad_input_alike(project: Path) -> None:
+    output = run(project, "model", "fit", "--data.path", "nowhere.h5", expected=2)
+    assert "envtf: nowhere.h5" in output.splitlines()[-1]
+    assert "Traceback" not in output
+
+
+def run(folder: Path, *arguments: str, expected: int = 0) -> str:
+    """Runs `envtf` in a process of its own and returns all that it printed."""
+    result = subprocess.run(
+        [sys.executable, "-m", "envtf_lit", *arguments],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == expected, result.stdout
+    return result.stdout
