@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.world_models.interface import WorldModel
+from envtf_lit.world_models.interface import Prediction, WorldModel
 
 THRESHOLDS = (0.01, 0.1)
 HORIZONS = (1, 5, 10, 50, 100, 500, 1000)
@@ -95,7 +95,7 @@ def segments(dataset: OfflineDataset, count: int, length: int, *, seed: int) -> 
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Predictions along trajectories, in the data's units.
+    """Predictions along trajectories, in the data's units; what stands in the padding means nothing.
 
     Attributes:
         mean: (B, T, S + 1) of the next observation and, last, the reward.
@@ -116,18 +116,28 @@ def forecast(model: WorldModel, trajectories: Trajectories, *, feedback: Literal
         feedback: `imagined` feeds each predicted state back (open loop, no clipping); `recorded` shows the model the
             true state before every step, so that it predicts one step ahead with the true history (teacher forcing).
     """
-    steps = trajectories.actions.shape[1]
-    first = trajectories.observations[:, :1]
-    state = model.init(first, trajectories.actions[:, :0], torch.ones_like(trajectories.lengths))
-    means, variances = [], []
-    for t in range(steps):
+    rows = torch.argsort(trajectories.lengths, descending=True, stable=True)
+    running = trajectories.valid.sum(0).tolist()  # trajectories that last until each step
+    mean = torch.zeros_like(trajectories.targets)
+    std = torch.zeros_like(trajectories.targets)
+    first, none = trajectories.observations[rows, :1], trajectories.actions[rows, :0]
+    state = model.init(first, none, torch.ones_like(trajectories.lengths))
+    for t in range(trajectories.actions.shape[1]):
+        if running[t] <= len(rows) // 2:  # most have ended: go on with the others
+            rows = rows[: running[t]]
+            state = model.gather(state, torch.arange(len(rows), device=rows.device))
         if feedback == "recorded" and t > 0:
-            state = model.observe(state, trajectories.observations[:, t])
-        state, prediction = model.step(state, trajectories.actions[:, t], mode="mean")
-        variance = prediction.aleatoric.square()
-        variances.append(variance if prediction.epistemic is None else variance + prediction.epistemic.square())
-        means.append(prediction.mean)
-    return Forecast(torch.stack(means, 1), torch.stack(variances, 1).sqrt())
+            state = model.observe(state, trajectories.observations[rows, t])
+        state, prediction = model.step(state, trajectories.actions[rows, t], mode="mean")
+        mean[rows, t] = prediction.mean
+        std[rows, t] = _total_std(prediction)
+    return Forecast(mean, std)
+
+
+def _total_std(prediction: Prediction) -> Tensor:
+    if prediction.epistemic is None:
+        return prediction.aleatoric
+    return (prediction.aleatoric.square() + prediction.epistemic.square()).sqrt()
 
 
 def nmse(mean: Tensor, trajectories: Trajectories, scale: Scale) -> Tensor:
