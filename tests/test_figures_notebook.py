@@ -118,7 +118,7 @@ def test_the_report_prints_a_result_against_us_as_such(lost_experiment):
     outputs = [output for cell in executed.cells if cell.cell_type == "code" for output in cell.outputs]
     said = " ".join(output.data["text/markdown"] for output in outputs if "text/markdown" in output.get("data", {}))
     assert "not above the behaviour clone, CQL on data alone" in said
-    assert "Imagination **costs** 21.5 points" in said
-    assert "it did not help: -21.5 points" in said
+    assert "Imagination **hurt**: -21.5 points" in said
+    assert "it **hurt**: -21.5 points" in said
     assert not [output for output in outputs if output.output_type == "stream" and output.name == "stderr"]
     assert page.stat().st_size > 100_000

@@ -6,18 +6,19 @@ from pathlib import Path
 
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from envtf_lit.figures.style import COLOURS, LABELS, drawing, write_table
 
 CLOCKS = ("update", "updates", "step", "epoch")  # columns that count progress rather than measure something
 TITLES = {
-    "loss": "loss (per dimension)",
+    "loss": "loss",
     "open_loop_error": "open-loop nmse",
     "q_data": "Q at the data's actions",
     "q_policy": "Q at the policy's actions",
+    "q_target": "TD target",
     "conservative_gap": "conservative gap",
     "bellman_loss": "Bellman loss",
-    "q_target": "TD target",
     "critic_loss": "critic loss",
     "warm_critic_loss": "critic loss, warm start",
     "clone_loss": "actor loss, warm start",
@@ -54,7 +55,9 @@ def learning_curves(runs: Mapping[str, pd.DataFrame], path: str | Path, *, title
         title: over all panels.
     """
     table = tidy_curves(runs)
-    quantities = list(table["quantity"].unique())[:MOST_PANELS]
+    order = list(TITLES)
+    known = sorted(table["quantity"].unique(), key=lambda name: order.index(name) if name in TITLES else len(order))
+    quantities = known[:MOST_PANELS]
     columns = min(3, len(quantities))
     rows = math.ceil(len(quantities) / columns)
     with drawing(path, (4.2 * columns, 2.9 * rows + 0.6), rows, columns) as (figure, axes):
@@ -84,3 +87,4 @@ def _panel(axis: Axes, lines: pd.DataFrame, quantity: str, *, single: bool) -> N
     if values.min() > 0 and values.max() > 30 * values.min():
         axis.set_yscale("log")
     axis.set(title=TITLES.get(quantity, quantity.replace("_", " ")), xlabel=lines["clock"].iloc[0])
+    axis.xaxis.set_major_locator(MaxNLocator(6, integer=True))

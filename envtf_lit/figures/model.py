@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from envtf_lit.evaluation.calibration import coverage
 from envtf_lit.figures.style import COLOURS, drawing, featured, observation_labels, write_table
@@ -71,6 +71,7 @@ def one_step_predictions(report: HorizonReport, robot: str | None, path: str | P
             axis.scatter(x, y, s=6, color=COLOURS["imagined"], alpha=0.3, linewidths=0, zorder=2)
             unexplained = float(((y - x) ** 2).sum() / max(float(((x - x.mean()) ** 2).sum()), 1e-12))
             axis.set(xlabel="recorded", xlim=(low, high), ylim=(low, high))
+            axis.xaxis.set_major_locator(MaxNLocator(4))
             axis.set_title(f"{name}\nunexplained variance {unexplained:.2g}", fontsize="medium")
         axes[0, 0].set_ylabel("predicted")
         figure.suptitle("One step ahead, on held-out episodes")
