@@ -1,7 +1,9 @@
 """The command line, `envtf`: a command per stage, Lightning's own command lines, and what helps around them."""
 
 import argparse
+import logging
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from textwrap import fill
@@ -128,9 +130,16 @@ def _stage(namespace: argparse.Namespace, rest: list[str]) -> None:
     params = load_params(namespace.params, flags_to_overrides(rest))
     from envtf_lit import pipeline
 
+    _hush_lightning()
     extra = {"algorithm": namespace.algorithm} if namespace.command == "train_policy" else {}
     metrics = getattr(pipeline, namespace.command)(params, **extra, progress=not namespace.quiet)
     Console().print_json(data=metrics)
+
+
+def _hush_lightning() -> None:
+    """A stage shows progress and a result; Lightning's hints, and its use of an older torch's names, help nobody."""
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
 
 
 def flags_to_overrides(flags: Sequence[str]) -> list[str]:
