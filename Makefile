@@ -39,10 +39,10 @@ else
 endif
 
 test: .venv/.installed-dev
-	pytest -q
+	pytest -q -n auto
 
 test-all: .venv/.installed-dev
-	pytest -q -m "slow or not slow"
+	pytest -q -n auto -m "slow or not slow"
 
 lint: .venv/.installed-dev
 	ruff format --check .

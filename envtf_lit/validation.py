@@ -33,7 +33,7 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("horizon", "buffer_size", "hidden", "critics", "sampled_actions", "episodes"), _COUNT),
     **dict.fromkeys(("trajectories", "n_step"), _COUNT),
     **dict.fromkeys(("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty"), _NOT_NEGATIVE),
-    **dict.fromkeys(("cql_weight", "warm_start"), _NOT_NEGATIVE),
+    **dict.fromkeys(("cql_weight", "warm_start", "clone_weight"), _NOT_NEGATIVE),
     **dict.fromkeys(("learning_rate", "actor_learning_rate", "critic_learning_rate"), _POSITIVE),
     **dict.fromkeys(("warm_start_learning_rate", "eps", "gradient_clip", "temperature", "initial_alpha"), _POSITIVE),
     **dict.fromkeys(("dropout", "warmup", "discount"), _SHARE),
