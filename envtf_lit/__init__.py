@@ -1,14 +1,19 @@
 """Environment Transformer and Conservative Q-Learning: from a log of trajectories to a world model and a policy."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from envtf_lit.data.formats import load_dataset
+    from envtf_lit.policy import load_policy
+    from envtf_lit.world_models.store import load_world_model
 
 _EXPORTS = {
     "load_dataset": "envtf_lit.data.formats",
     "load_policy": "envtf_lit.policy",
     "load_world_model": "envtf_lit.world_models.store",
 }
-__all__ = ["load_dataset", "load_policy", "load_world_model"]  # noqa: F822 (imported on first use)
+__all__ = ["load_dataset", "load_policy", "load_world_model"]
 
 
 def __getattr__(name: str) -> Any:

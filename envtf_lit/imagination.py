@@ -83,7 +83,9 @@ class BranchPoints:
         device = self.starts.device
         row = torch.randint(len(self.starts), (count,), generator=generator, device=device)
         start = torch.maximum(row - history, self.starts[row])
-        index = torch.minimum(start[:, None] + torch.arange(history + 1, device=device), row[:, None])  # (B, history + 1)
+        index = torch.minimum(
+            start[:, None] + torch.arange(history + 1, device=device), row[:, None]
+        )  # (B, history + 1)
         return self.observations[index], self.actions[index[:, :-1]], row - start + 1
 
 
@@ -93,9 +95,7 @@ class NoisyPolicy:
     def __init__(self, actor: TanhGaussianActor, scale: float) -> None:
         self.actor, self.scale = actor, scale
 
-    def act(
-        self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None
-    ) -> Tensor:
+    def act(self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None) -> Tensor:
         """Observations (B, S) to actions (B, A)."""
         action = self.actor.act(observation, deterministic, generator)
         noise = torch.randn(action.shape, generator=generator, device=action.device)

@@ -147,9 +147,11 @@ class PolicyOptions:
         n_step: real steps whose rewards enter the temporal-difference target.
         target_rate: share of the critics that enters the target networks at each update.
         actor_learning_rate: Adam's.
+        actor_schedule: of the actor's learning rate after the warm start: `constant`, or half a cosine to zero.
         critic_learning_rate: Adam's.
         cql_weight: weight of the conservative term.
         initial_alpha: weight of the entropy in the actor's objective at the start; learned from there on.
+        clone_weight: weight in the actor's objective of cloning those logged actions whose Q exceeds the policy's own.
         sampled_actions: actions of each kind (uniform, pi(s), pi(s')) in the log-sum-exp.
         temperature: of the log-sum-exp.
         warm_start: first updates, in which the critics fit Monte-Carlo returns and the actor clones the data.
@@ -169,9 +171,11 @@ class PolicyOptions:
     n_step: int = 1
     target_rate: float = 0.005
     actor_learning_rate: float = 0.0001
+    actor_schedule: Literal["constant", "cosine"] = "cosine"
     critic_learning_rate: float = 0.0003
     cql_weight: float = 5.0
     initial_alpha: float = 0.1
+    clone_weight: float = 0.0
     sampled_actions: int = 4
     temperature: float = 1.0
     warm_start: int = 2_000

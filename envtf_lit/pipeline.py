@@ -4,7 +4,6 @@ Each reads what the stages before it wrote below `root`, writes its own outputs 
 """
 
 import contextlib
-import json
 import resource
 import time
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ DATASET, CARD = Path("data/dataset.h5"), Path("data/dataset.json")
 WORLD_MODEL, BEHAVIOUR = Path("models/world_model"), Path("models/behaviour")
 ROLLOUTS, POLICIES = Path("data/rollouts.h5"), Path("models/policy")
 REPORTS, METRICS = Path("reports"), Path("reports/metrics.json")
+PLOTS, VIDEO = Path("reports/plots"), Path("reports/video")
 ALGORITHMS = ("cql", "et_cql")
 
 
@@ -179,6 +179,81 @@ def train_policy(
             _record(folder, metrics, key)
             curves.write(folder / "curves.csv")
     return metrics
+
+
+def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
+    """Scores policies in MuJoCo and the model on held-out episodes: `reports/metrics.json`, `plots/`, `video/`."""
+    import pandas as pd
+
+    from envtf_lit.data.formats import load_dataset
+    from envtf_lit.evaluation.evidence import collect_metrics, world_model_metrics
+    from envtf_lit.evaluation.returns import evaluate_policy
+    from envtf_lit.figures import gallery
+    from envtf_lit.figures.video import real_vs_imagined
+    from envtf_lit.imagination import load_rollouts
+    from envtf_lit.policy import load_policy
+    from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
+    from envtf_lit.world_models.store import load_world_model
+
+    options, robot = params.evaluate, _robot(params)
+    with _stage("evaluate", params, root):
+        dataset, rollouts = load_dataset(root / DATASET), load_rollouts(root / ROLLOUTS)
+        model = load_world_model(root / WORLD_MODEL)
+        training, held_out = dataset.split(params.train_model.held_out, seed=params.seed)
+        scale = Scale.of(training)
+        trajectories = whole_episodes(held_out, options.trajectories, seed=params.seed)
+        report = horizon_report(model, trajectories, scale)
+        folders = {"bc": BEHAVIOUR, **{name: POLICIES / name for name in ALGORITHMS}}
+        returns = {
+            name: evaluate_policy(
+                load_policy(root / folder), robot, episodes=options.episodes, seed=params.seed, progress=progress
+            )
+            for name, folder in folders.items()
+        }
+        metrics = collect_metrics(
+            task=params.task,
+            seed=params.seed,
+            dataset=dataset,
+            robot=robot,
+            world_model=world_model_metrics(report, scale, parameters=sum(p.numel() for p in model.parameters())),
+            rollouts=len(rollouts),
+            policy=returns["et_cql"],
+            baselines={name: returns[name] for name in ("bc", "cql")},
+        )
+        curves = {name: pd.read_csv(root / POLICIES / name / "curves.csv") for name in ALGORITHMS}
+        with replacing(root / PLOTS) as plots:
+            plots.mkdir()
+            gallery.draw_dataset(dataset, plots)
+            gallery.draw_world_model(report, scale, robot, pd.read_csv(root / WORLD_MODEL / "curves.csv"), plots)
+            gallery.draw_rollouts(rollouts.step.numpy(), rollouts.uncertainty.numpy(), plots)
+            gallery.draw_policies(dataset, robot, returns, curves, plots)
+        with replacing(root / VIDEO) as video:
+            video.mkdir()
+            real_vs_imagined(
+                model,
+                returns["et_cql"].median,
+                robot,
+                scale,
+                video / "real_vs_imagined.gif",
+                frames=options.video_frames,
+            )
+        write_json(root / METRICS, metrics)
+    return metrics
+
+
+def report(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
+    """Executes `notebooks/report.ipynb` on the other stages' outputs: `reports/report.ipynb` and `.html`."""
+    from envtf_lit.figures.notebook import execute
+
+    with _stage("report", params, root):
+        page = execute(
+            root / "notebooks/report.ipynb",
+            root / REPORTS / "report.ipynb",
+            {"root": "."},
+            cwd=root,
+            progress=progress,
+        )
+    return {"report": str(page)}
 
 
 def _give_imagination(agent: Any, params: Params, root: Path, dataset: Any) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,9 +18,7 @@ LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 class Policy(Protocol):
     """Anything that acts: agents, behaviour policies, planners, exported models."""
 
-    def act(
-        self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None
-    ) -> Tensor:
+    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
         """Observations (B, S) to actions (B, A) in the environment's own action range."""
         ...
 
@@ -27,7 +26,7 @@ class Policy(Protocol):
 def mlp(sizes: Sequence[int], *, layer_norm: bool = False) -> nn.Sequential:
     """Linear layers of these sizes with ReLU (after an optional LayerNorm) between them."""
     layers: list[nn.Module] = []
-    for index, (fan_in, fan_out) in enumerate(zip(sizes, sizes[1:], strict=False)):
+    for index, (fan_in, fan_out) in enumerate(pairwise(sizes)):
         layers.append(nn.Linear(fan_in, fan_out))
         if index < len(sizes) - 2:
             layers += [nn.LayerNorm(fan_out), nn.ReLU()] if layer_norm else [nn.ReLU()]
@@ -84,9 +83,7 @@ class TanhGaussianActor(nn.Module):
     def _scale(self, squashed: Tensor) -> Tensor:
         return self.action_low + 0.5 * (squashed + 1.0) * (self.action_high - self.action_low)
 
-    def act(
-        self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None
-    ) -> Tensor:
+    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
         """Observations (B, S) to actions (B, A): tanh of the mean, or of a sample drawn with `generator`."""
         with torch.no_grad():
             mean, log_std = self(observation)
@@ -139,9 +136,7 @@ class RandomPolicy:
     def __init__(self, action_low: Tensor, action_high: Tensor) -> None:
         self.action_low, self.action_high = action_low, action_high
 
-    def act(
-        self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None
-    ) -> Tensor:
+    def act(self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None) -> Tensor:
         """Observations (B, S) to uniform actions (B, A); `deterministic` changes nothing: it has no mode to return."""
         size = (len(observation), len(self.action_low))
         uniform = torch.rand(size, generator=generator, device=self.action_low.device)

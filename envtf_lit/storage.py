@@ -94,9 +94,9 @@ def load_module(folder: str | Path, registry: Mapping[str, type[nn.Module]]) -> 
     if not folder.is_dir():
         raise UserError(f"{folder} is not a model folder: it does not exist; run the stage that writes it.")
     config = read_json(folder / "config.json")
-    kind = config.get("kind") if isinstance(config, dict) else None
+    kind = str(config.get("kind")) if isinstance(config, dict) else ""
     if kind not in registry:
-        raise UserError(f"{folder}/config.json names the unknown kind {kind!r}: {did_you_mean(str(kind), registry)}")
+        raise UserError(f"{folder}/config.json names the unknown kind {kind!r}: {did_you_mean(kind, registry)}")
     try:
         module = registry[kind](**config["arguments"])
     except (TypeError, KeyError, ValueError) as error:

@@ -75,9 +75,7 @@ ROBOTS = {
         Robot("halfcheetah", "HalfCheetah-v5", 17, 6, -280.178953, 12135.0, never_terminated),
         Robot("walker2d", "Walker2d-v5", 17, 6, 1.629008, 4592.3, walker2d_terminated),
         # without the contact forces: the dimensions that are not constant zero in D4RL's Ant
-        Robot(
-            "ant", "Ant-v5", 27, 8, -325.6, 3879.7, ant_terminated, {"include_cfrc_ext_in_observation": False}
-        ),
+        Robot("ant", "Ant-v5", 27, 8, -325.6, 3879.7, ant_terminated, {"include_cfrc_ext_in_observation": False}),
     )
 }
 

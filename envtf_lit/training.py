@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import json
+import logging
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from torch import Tensor
 from envtf_lit.params import Precision
 from envtf_lit.storage import replacing
 
+logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # says what hardware there is at every fit
 RUNS = Path(".envtf/runs")
 
 
@@ -45,6 +47,7 @@ class Curves(Checkpoint):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         values = {name: float(value) for name, value in sorted(trainer.callback_metrics.items())}
         self.rows.append({"epoch": trainer.current_epoch + 1, **values})
+        trainer.callback_metrics.clear()  # or what a later epoch does not log would be repeated there
 
     def state_dict(self) -> dict[str, Any]:
         return {"rows": self.rows}
@@ -80,11 +83,11 @@ def fit(
         monitor: logged name to select the kept weights by.
         gradient_clip: largest gradient norm, for automatic optimisation alone.
     """
-    curves, last = Curves(), ModelCheckpoint(dirpath=run, filename="last", enable_version_counter=False)
-    callbacks: list[Callback] = [curves, last]
+    curves, callbacks = Curves(), list[Callback]()
     if monitor is not None:
-        best = ModelCheckpoint(dirpath=run, filename="best", monitor=monitor, enable_version_counter=False)
-        callbacks.append(best)
+        callbacks.append(ModelCheckpoint(dirpath=run, filename="best", monitor=monitor, enable_version_counter=False))
+    # after the others, whose state of this epoch it must hold
+    callbacks += [curves, ModelCheckpoint(dirpath=run, filename="last", enable_version_counter=False)]
     if progress:
         callbacks.append(RichProgressBar())
     trainer = L.Trainer(

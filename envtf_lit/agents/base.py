@@ -1,6 +1,8 @@
 """What offline actor-critic agents share: batches of data and imagination, the warm start, targets, the update loop."""
 
 import copy
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
@@ -20,7 +22,7 @@ from envtf_lit.world_models.interface import WorldModel
 Batch = dict[str, Tensor]
 
 
-class OfflineAgent(L.LightningModule):
+class OfflineAgent(L.LightningModule, ABC):
     """Actor, critics and their targets, updated several times per training step (manual optimisation).
 
     A batch holds (K, B, …) transitions for K gradient steps; there is no host synchronisation between them. With
@@ -105,18 +107,17 @@ class OfflineAgent(L.LightningModule):
     def on_train_epoch_start(self) -> None:
         self.generator = epoch_generator(self.seed, self.current_epoch, "agent")
         self.update_index = self.current_epoch * self.options.updates_per_epoch
-        self.log_sums: dict[str, Tensor] = {}
+        self.logged: dict[str, list[Tensor]] = {}
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
         for k in range(len(batch["rewards"])):
             logs = self.update({name: column[k] for name, column in batch.items()})
             for name, value in logs.items():
-                self.log_sums[name] = self.log_sums.get(name, 0.0) + value.detach()
+                self.logged.setdefault(name, []).append(value.detach())
             self.update_index += 1
 
     def on_train_epoch_end(self) -> None:
-        updates = self.options.updates_per_epoch
-        self.log_dict({f"train/{name}": value / updates for name, value in self.log_sums.items()}, prog_bar=False)
+        self.log_dict({f"train/{name}": torch.stack(values).mean() for name, values in self.logged.items()})
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         o = self.options
@@ -157,13 +158,21 @@ class OfflineAgent(L.LightningModule):
         return dict(warm_critic_loss=critic_loss, clone_loss=clone_loss, q_data=q.mean())
 
     def _optimizers(self) -> list[Any]:
-        """The three optimisers, at the learning rates of the current phase."""
-        o, warm = self.options, self.update_index < self.options.warm_start
-        rates = [o.actor_learning_rate, o.critic_learning_rate, o.actor_learning_rate]
+        """The three optimisers, at the learning rates of the current update."""
         optimizers: list[Any] = self.optimizers()  # pyright: ignore[reportAssignmentType]
-        for optimizer, rate in zip(optimizers, rates, strict=True):
-            optimizer.param_groups[0]["lr"] = o.warm_start_learning_rate if warm else rate
+        for optimizer, rate in zip(optimizers, self._rates(), strict=True):
+            optimizer.param_groups[0]["lr"] = rate
         return optimizers
+
+    def _rates(self) -> tuple[float, float, float]:
+        """Learning rates of actor, critics and alpha."""
+        o, done = self.options, self.update_index - self.options.warm_start
+        if done < 0:
+            return o.warm_start_learning_rate, o.warm_start_learning_rate, 0.0
+        actor = o.actor_learning_rate
+        if o.actor_schedule == "cosine":
+            actor *= 0.5 * (1.0 + math.cos(math.pi * done / max(1, o.updates - o.warm_start)))
+        return actor, o.critic_learning_rate, o.actor_learning_rate
 
     def mix(self, batch: Batch) -> Batch:
         """Replaces the last rows of a real batch by imagined ones; `real` (B,) marks what is real."""
@@ -207,21 +216,26 @@ class OfflineAgent(L.LightningModule):
     @torch.no_grad()
     def follow(self) -> None:
         """Targets move towards the critics, the averaged actor towards the actor."""
-        rate = self.options.target_rate
-        torch._foreach_lerp_(list(self.target_critics.parameters()), list(self.critics.parameters()), rate)
-        rate = self.options.actor_average
-        torch._foreach_lerp_(list(self.average_actor.parameters()), list(self.actor.parameters()), rate)
+        for follower, leader, rate in (
+            (self.target_critics, self.critics, self.options.target_rate),
+            (self.average_actor, self.actor, self.options.actor_average),
+        ):
+            for slow, fast in zip(follower.parameters(), leader.parameters(), strict=True):
+                slow.lerp_(fast, rate)
 
-    # What an algorithm defines
+    # What an algorithm defines: losses, and detached scalars to log
 
+    @abstractmethod
     def critic_loss(self, batch: Batch, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        raise NotImplementedError
+        """Of a mixed batch, reaching the critics alone."""
 
+    @abstractmethod
     def actor_loss(self, batch: Batch, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        raise NotImplementedError
+        """Of a mixed batch; logs `entropy`."""
 
+    @abstractmethod
     def temperature_loss(self, entropy: Tensor) -> Tensor:
-        raise NotImplementedError
+        """Of the actor's mean entropy, reaching `log_alpha` alone."""
 
 
 def _descend(module: L.LightningModule, optimizer: Any, loss: Tensor) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -37,9 +38,7 @@ class StackedCritics(nn.Module):
         super().__init__()
         self.from_observation = StackedLinear(n, observation_dim, hidden[0])
         self.from_action = StackedLinear(n, action_dim, hidden[0])
-        self.hidden = nn.ModuleList(
-            StackedLinear(n, a, b) for a, b in zip(hidden, hidden[1:], strict=False)
-        )
+        self.hidden = nn.ModuleList(StackedLinear(n, a, b) for a, b in pairwise(hidden))
         self.out = StackedLinear(n, hidden[-1], 1)
         self.n, self.layer_norm = n, layer_norm
         self.register_buffer("observation_mean", torch.zeros(observation_dim))

@@ -4,7 +4,7 @@ Every epoch draws from a generator seeded by (seed, epoch), so a run resumed at 
 one that was never interrupted.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import lightning as L
 import numpy as np
@@ -113,6 +113,11 @@ class Transitions(Dataset[dict[str, Tensor]]):
         return {name: column[rows] for name, column in self.columns.items()}
 
 
+def _loader(dataset: Dataset[dict[str, Tensor]], draws: Iterable[Tensor]) -> DataLoader[dict[str, Tensor]]:
+    """Batches of whole draws; its own generator, since a DataLoader takes a number from the global one per epoch."""
+    return DataLoader(dataset, sampler=draws, batch_size=None, generator=torch.Generator())
+
+
 class WindowData(L.LightningDataModule):
     """Windows for world models, with whole episodes held out for validation.
 
@@ -151,12 +156,12 @@ class WindowData(L.LightningDataModule):
         """Batches (B, T, …) of `Windows`."""
         windows = Windows(self.train, self.context)
         sampler = DrawSampler(len(windows), (self.batch_size,), self.updates_per_epoch, seed=self.seed)
-        return DataLoader(windows, sampler=sampler, batch_size=None)
+        return _loader(windows, sampler)
 
     def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:
         """Each held-out row once."""
         windows = Windows(self.held_out, self.context)
-        return DataLoader(windows, sampler=list(windows.tiles().split(256)), batch_size=None)  # pyright: ignore[reportArgumentType]
+        return _loader(windows, windows.tiles().split(256))
 
 
 class TransitionData(L.LightningDataModule):
@@ -193,4 +198,4 @@ class TransitionData(L.LightningDataModule):
         transitions = Transitions(self.dataset, discount=self.discount, n_step=self.n_step)
         shape = (self.updates_per_step, self.batch_size)
         sampler = DrawSampler(len(transitions), shape, self.steps_per_epoch, seed=self.seed)
-        return DataLoader(transitions, sampler=sampler, batch_size=None)
+        return _loader(transitions, sampler)

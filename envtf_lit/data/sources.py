@@ -16,7 +16,9 @@ from envtf_lit.tasks import Task, get_task
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
-def make_dataset(task: Task, options: DownloadOptions, *, seed: int, workers: int) -> OfflineDataset:
+def make_dataset(
+    task: Task, options: DownloadOptions, *, seed: int, workers: int, progress: bool = True
+) -> OfflineDataset:
     """The task's dataset from `options.source`.
 
     Args:
@@ -24,6 +26,7 @@ def make_dataset(task: Task, options: DownloadOptions, *, seed: int, workers: in
         options: the source, and what it needs.
         seed: of the zoo's environments and actions; a file has no use for it.
         workers: processes that collect; they do not change the result.
+        progress: shows a bar with the time left.
 
     Raises:
         UserError: the zoo lacks the task, `options.path` is missing or not wanted, or the file is bad.
@@ -37,7 +40,7 @@ def make_dataset(task: Task, options: DownloadOptions, *, seed: int, workers: in
             f"download.path is {options.path} and download.source is zoo, which reads no file: set the source to file, "
             "or the path to null."
         )
-    return collect(task, options.transitions, seed=seed, workers=workers)
+    return collect(task, options.transitions, seed=seed, workers=workers, progress=progress)
 
 
 def dataset_card(dataset: OfflineDataset, options: DownloadOptions, seed: int) -> dict[str, Any]:

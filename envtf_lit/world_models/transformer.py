@@ -6,7 +6,7 @@ generation equals the uncached forward pass at every step, past the context leng
 """
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -132,9 +132,12 @@ class EnvironmentTransformer(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, (3 if self.has_epistemic_head else 2) * (observation_dim + 1))
         self.apply(_initialise)
-        for block in self.blocks:  # residual branches start small: sum of 2L terms keeps unit scale (GPT-2)
-            for linear in (block.attention.out, block.mlp[2]):
-                nn.init.normal_(linear.weight, std=0.02 * (2 * self.options.layers) ** -0.5)
+        for block in self._stack():  # residual branches start small: sum of 2L terms keeps unit scale (GPT-2)
+            for weight in (block.attention.out.weight, block.mlp[2].weight):
+                nn.init.normal_(cast(Tensor, weight), std=0.02 * (2 * self.options.layers) ** -0.5)
+
+    def _stack(self) -> list[Block]:
+        return cast(list[Block], list(self.blocks))
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -156,20 +159,27 @@ class EnvironmentTransformer(nn.Module):
         """Last hidden tokens (B, T, D) and, if `cached`, each layer's keys and values (B, H, T, d)."""
         T = observations.shape[1]
         positions = torch.arange(T, device=observations.device)
-        mask = None
-        if T > self.options.context or first is not None:
-            mask = window_mask(T, self.options.context, observations.device)
-        if first is not None:  # a row's padding on the left sees only itself, so that its softmax stays finite
-            seen = positions >= first[:, None]  # (B, T)
-            mask = (mask & seen[:, None, :] | torch.eye(T, dtype=torch.bool, device=positions.device))[:, None]
+        mask = self._mask(positions, first)
         x = self.embed(self.normaliser.token(observations, actions))
         cache = []
-        for block in self.blocks:
+        for block in self._stack():
             q, k, v = block.attention.project(block.attention_norm(x), positions)
             if cached:
                 cache.append((k, v))
             x = block.finish(x, block.attention(q, k, v, mask))
         return self.norm(x), cache
+
+    def _mask(self, positions: Tensor, first: Tensor | None) -> Tensor | None:
+        """(T, T), or (B, 1, T, T) where rows begin at `first`, or None where plain causal attention is meant."""
+        T = len(positions)
+        if T <= self.options.context and first is None:
+            return None
+        mask = window_mask(T, self.options.context, positions.device)
+        if first is None:
+            return mask
+        seen = positions >= first[:, None]  # (B, T)
+        itself = torch.eye(T, dtype=torch.bool, device=positions.device)  # padding on the left needs a finite softmax
+        return (mask & seen[:, None, :] | itself)[:, None]
 
     def heads(self, hidden: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Hidden tokens (..., D) to mean, log-variance, epistemic log-variance or None, each (..., S + 1), in fp32."""
@@ -222,7 +232,7 @@ class EnvironmentTransformer(nn.Module):
         filled = min(state.clock + 1, self.options.context)
         slot, mask = state.clock % self.options.context, self._visible(state, filled)
         cache = []
-        for block, (keys, values) in zip(self.blocks, state.cache, strict=True):
+        for block, (keys, values) in zip(self._stack(), state.cache, strict=True):
             q, k, v = block.attention.project(block.attention_norm(x), position)
             keys, values = _write(keys, k, slot), _write(values, v, slot)
             cache.append((keys, values))

@@ -1,0 +1,153 @@
+"""Runs that resume to the same bits, start afresh when a parameter changes, and keep the best model."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import lightning as L
+import pytest
+import torch
+from lightning.pytorch.callbacks import Callback
+
+from envtf_lit import pipeline
+from envtf_lit.data.formats import save_dataset
+from envtf_lit.params import ImaginationOptions, ModelOptions, Params, PolicyOptions, TrainModelOptions
+from envtf_lit.storage import load_weights
+from envtf_lit.training import run_folder
+from envtf_lit.world_models.store import load_world_model
+from tests.walker import walker_dataset
+
+TINY = Params(
+    threads=1,
+    train_model=TrainModelOptions(
+        model=ModelOptions(layers=1, heads=2, width=16, context=6, dropout=0.1),
+        updates=12,
+        updates_per_epoch=4,
+        batch_size=8,
+        held_out=0.2,
+    ),
+)
+POLICY = PolicyOptions(
+    updates=12,
+    updates_per_epoch=4,
+    updates_per_step=2,
+    batch_size=16,
+    hidden=(16, 16),
+    warm_start=4,
+    imagination=ImaginationOptions(refresh_every=2, branches=20, horizon=2, history=2, buffer_size=100),
+)
+TINY = replace(
+    TINY,
+    generate_rollouts=replace(TINY.generate_rollouts, clone_updates=100, clone_batch_size=16, branches=30),
+    train_policy=replace(TINY.train_policy, cql=replace(POLICY, imagination=None), et_cql=POLICY),
+)
+
+
+class Killed(Exception):
+    """Stands for a process that dies."""
+
+
+class Killer(Callback):
+    """Dies in the middle of the epoch of that index."""
+
+    def __init__(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: object) -> None:
+        if trainer.current_epoch == self.epoch:
+            raise Killed
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    save_dataset(walker_dataset(), tmp_path / "data/dataset.h5")
+    return tmp_path
+
+
+def kill_in_epoch(monkeypatch: pytest.MonkeyPatch, epoch: int) -> None:
+    trainer = L.Trainer
+    monkeypatch.setattr(
+        "envtf_lit.training.L.Trainer",
+        lambda **kwargs: trainer(**{**kwargs, "callbacks": [*kwargs["callbacks"], Killer(epoch)]}),
+    )
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in sorted(folder.iterdir())}
+
+
+def train_both(root: Path, params: Params = TINY) -> dict[str, bytes]:
+    pipeline.train_model(params, root, progress=False)
+    return bytes_of(root / "models/world_model")
+
+
+def test_a_killed_model_run_resumes_to_the_same_bits(root, monkeypatch):
+    expected = train_both(root)
+    with monkeypatch.context() as patch:
+        kill_in_epoch(patch, 2)
+        with pytest.raises(Killed):
+            train_both(root)
+    (run,) = (root / ".envtf/runs").iterdir()
+    assert torch.load(run / "last.ckpt", weights_only=True)["epoch"] == 1
+    assert train_both(root) == expected
+    assert not run.exists()
+
+
+def test_a_kill_followed_by_another_parameter_trains_afresh(root, monkeypatch):
+    with monkeypatch.context() as patch:
+        kill_in_epoch(patch, 2)
+        with pytest.raises(Killed):
+            train_both(root)
+    changed = replace(TINY, seed=1)
+    after_kill = train_both(root, changed)
+    assert after_kill == train_both(root, changed)
+
+
+def test_the_kept_model_is_the_one_of_least_open_loop_error(root):
+    metrics = pipeline.train_model(TINY, root, progress=False)
+    with (root / "models/world_model/curves.csv").open() as stream:
+        errors = [float(row["val/open_loop_error"]) for row in csv.DictReader(stream)]
+    assert len(errors) == 3 and metrics["open_loop_error"] == min(errors)
+
+
+@pytest.mark.parametrize("algorithm", ["cql", "et_cql"])
+def test_a_killed_policy_run_resumes_to_the_same_bits(root, monkeypatch, algorithm):
+    pipeline.train_model(TINY, root, progress=False)
+    pipeline.generate_rollouts(TINY, root, progress=False)
+    train = lambda: pipeline.train_policy(TINY, root, algorithm=algorithm, progress=False)  # noqa: E731
+    train()
+    expected = bytes_of(root / "models/policy" / algorithm)
+    with monkeypatch.context() as patch:
+        kill_in_epoch(patch, 2)
+        with pytest.raises(Killed):
+            train()
+    train()
+    assert bytes_of(root / "models/policy" / algorithm) == expected
+
+
+def test_gradient_steps_are_those_asked_for(root):
+    pipeline.train_policy(TINY, root, algorithm="cql", progress=False)
+    with (root / "models/policy/cql/curves.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["epoch"] for row in rows] == ["1", "2", "3"]
+    assert rows[0]["train/clone_loss"] and not rows[0]["train/bellman_loss"]  # the warm start is the first epoch
+    assert rows[2]["train/bellman_loss"]
+
+
+def test_run_folders_differ_by_parameters_and_by_bytes(tmp_path):
+    data = tmp_path / "data.h5"
+    data.write_bytes(b"one")
+    first = run_folder(tmp_path, "stage", {"seed": 0}, [data])
+    assert first == run_folder(tmp_path, "stage", {"seed": 0}, [data])
+    assert first != run_folder(tmp_path, "stage", {"seed": 1}, [data])
+    data.write_bytes(b"two")
+    assert first != run_folder(tmp_path, "stage", {"seed": 0}, [data])
+
+
+def test_saved_models_come_back_whole(root):
+    train_both(root)
+    model = load_world_model(root / "models/world_model")
+    again = load_world_model(root / "models/world_model")
+    load_weights(again, root / "models/world_model/weights.safetensors")
+    assert not model.training
+    assert all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), again.state_dict().values(), strict=True))
