@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import torch
 from torch import Tensor
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
+from envtf_lit.params import ImaginationOptions
 from envtf_lit.policy import Policy, TanhGaussianActor
 from envtf_lit.storage import replacing
 from envtf_lit.world_models.interface import Mode, WorldModel
@@ -141,6 +143,72 @@ def imagine(
             if len(alive) < len(branch):
                 state, branch = model.gather(state, alive), branch[alive]
     return Rollouts(**{field.name: torch.cat([getattr(p, field.name) for p in parts]) for field in fields(Rollouts)})
+
+
+class Imagination:
+    """A world model at an agent's service: branched rollouts to learn from, whole episodes to be judged by.
+
+    Args:
+        model: any world model, on `device`.
+        dataset: gives the states to branch from and the first states of episodes.
+        terminated: the robot's rule.
+        options: of the rollouts and of the judgement.
+    """
+
+    def __init__(
+        self,
+        model: WorldModel,
+        dataset: OfflineDataset,
+        terminated: Callable[[Tensor], Tensor],
+        options: ImaginationOptions,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.model, self.terminated, self.options = model, terminated, options
+        self.starts = BranchPoints(dataset, device)
+        chosen = np.linspace(0, len(dataset.episode_starts) - 1, max(1, options.selection_episodes)).astype(int)
+        self.first = torch.as_tensor(dataset.observations[dataset.episode_starts[chosen]], device=device)
+
+    def rollouts(self, policy: Policy, generator: torch.Generator) -> Rollouts:
+        """New branched rollouts under the policy's sampled actions."""
+        o = self.options
+        starts = self.starts.draw(o.branches, o.history, generator)
+        return imagine(
+            self.model,
+            policy,
+            starts,
+            horizon=o.horizon,
+            terminated=self.terminated,
+            mode=o.mode,
+            generator=generator,
+        )
+
+    def imagined_return(self, policy: Policy) -> float:
+        """Mean undiscounted return of imagined episodes, from recorded first states, deterministic actions, mean model.
+
+        Episodes last `selection_steps`, unless the robot falls first.
+        """
+        B = len(self.first)
+        no_actions = self.first.new_zeros(B, 0, self.model.action_dim)
+        starts = self.first[:, None], no_actions, torch.ones(B, dtype=torch.long, device=self.first.device)
+        episodes = imagine(
+            self.model,
+            _Deterministic(policy),
+            starts,
+            horizon=self.options.selection_steps,
+            terminated=self.terminated,
+            mode="mean",
+        )
+        return float(episodes.rewards.double().sum() / B)
+
+
+class _Deterministic:
+    """The same policy without its noise."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+
+    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
+        return self.policy.act(observation, True, generator)
 
 
 def _advance(

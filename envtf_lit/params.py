@@ -117,6 +117,9 @@ class ImaginationOptions:
         penalty: weight of the uncertainty u, in units of the data's reward standard deviation: `r - weight * std * u`.
         penalty_up_on: rows on which the conservative term pushes Q up: `real` (COMBO's form) or `mixture` (the
             paper's equation 5 read literally, which rewards the policy's own imagined actions).
+        selection_episodes: imagined episodes that judge the averaged actor after each epoch, from recorded first
+            states; the actor of highest imagined return is kept. 0 keeps the last.
+        selection_steps: of each such episode at most.
     """
 
     real_ratio: float = 0.5
@@ -129,6 +132,8 @@ class ImaginationOptions:
     multi_step: bool = True
     penalty: float = 0.0
     penalty_up_on: Literal["real", "mixture"] = "real"
+    selection_episodes: int = 32
+    selection_steps: int = 500
 
 
 @dataclass(frozen=True)
@@ -151,7 +156,6 @@ class PolicyOptions:
         critic_learning_rate: Adam's.
         cql_weight: weight of the conservative term.
         initial_alpha: weight of the entropy in the actor's objective at the start; learned from there on.
-        clone_weight: weight in the actor's objective of cloning those logged actions whose Q exceeds the policy's own.
         sampled_actions: actions of each kind (uniform, pi(s), pi(s')) in the log-sum-exp.
         temperature: of the log-sum-exp.
         warm_start: first updates, in which the critics fit Monte-Carlo returns and the actor clones the data.
@@ -175,7 +179,6 @@ class PolicyOptions:
     critic_learning_rate: float = 0.0003
     cql_weight: float = 5.0
     initial_alpha: float = 0.1
-    clone_weight: float = 0.0
     sampled_actions: int = 4
     temperature: float = 1.0
     warm_start: int = 2_000

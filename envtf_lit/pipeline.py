@@ -160,10 +160,11 @@ def train_policy(
             seed=params.seed,
         )
         agent.normalise_with(*observation_scale(torch.as_tensor(dataset.observations)))
-        inputs = [root / DATASET]
+        inputs, monitor = [root / DATASET], None
         if options.imagination is not None:
             _give_imagination(agent, params, root, dataset)
             inputs += [root / WORLD_MODEL, root / ROLLOUTS]
+            monitor = "val/imagined_return" if options.imagination.selection_episodes > 0 else None
         key = _key(params, asdict(options))
         curves = fit(
             agent,
@@ -172,8 +173,11 @@ def train_policy(
             epochs=options.updates // options.updates_per_epoch,
             precision=params.precision,
             progress=progress,
+            monitor=monitor,
+            mode="max",
         )
-        metrics = {name.removeprefix("train/"): value for name, value in curves.rows[-1].items()}
+        kept = max(curves.rows, key=lambda row: row[monitor]) if monitor else curves.rows[-1]
+        metrics = {name.rpartition("/")[2]: value for name, value in kept.items()}
         with replacing(root / POLICIES / algorithm) as folder:
             save_policy(folder, agent.average_actor)
             _record(folder, metrics, key)
@@ -258,17 +262,13 @@ def report(params: Params, root: Path = Path("."), *, progress: bool = True) -> 
 
 def _give_imagination(agent: Any, params: Params, root: Path, dataset: Any) -> None:
     """Hands an agent the world model and the stored rollouts."""
-    from envtf_lit.imagination import BranchPoints, load_rollouts
+    from envtf_lit.imagination import Imagination, load_rollouts
     from envtf_lit.world_models.store import load_world_model
 
     device = pick_device()
-    agent.reward_std = float(dataset.rewards.std())
-    agent.dream_with(
-        load_world_model(root / WORLD_MODEL).to(device),
-        BranchPoints(dataset, device),
-        _robot(params).terminated,
-        load_rollouts(root / ROLLOUTS),
-    )
+    model = load_world_model(root / WORLD_MODEL).to(device)
+    imagination = Imagination(model, dataset, _robot(params).terminated, agent.options.imagination, device)
+    agent.dream_with(imagination, load_rollouts(root / ROLLOUTS), reward_std=float(dataset.rewards.std()))
 
 
 def _robot(params: Params) -> Robot:

@@ -7,7 +7,7 @@ import logging
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning as L
 import torch
@@ -73,19 +73,23 @@ def fit(
     precision: Precision,
     progress: bool = True,
     monitor: str | None = None,
+    mode: Literal["min", "max"] = "min",
     gradient_clip: float | None = None,
 ) -> Curves:
     """Trains for `epochs`, resuming from `run` if a checkpoint lies there; leaves the module as it should be kept.
 
     Args:
-        module: holds its final weights afterwards, or with `monitor` those of the epoch where it was lowest.
+        module: holds its final weights afterwards, or with `monitor` those of the epoch where it was best.
         run: folder of the resumable checkpoints, removed at the end.
         monitor: logged name to select the kept weights by.
+        mode: whether the least or the largest value of `monitor` is best.
         gradient_clip: largest gradient norm, for automatic optimisation alone.
     """
     curves, callbacks = Curves(), list[Callback]()
     if monitor is not None:
-        callbacks.append(ModelCheckpoint(dirpath=run, filename="best", monitor=monitor, enable_version_counter=False))
+        callbacks.append(
+            ModelCheckpoint(dirpath=run, filename="best", monitor=monitor, mode=mode, enable_version_counter=False)
+        )
     # after the others, whose state of this epoch it must hold
     callbacks += [curves, ModelCheckpoint(dirpath=run, filename="last", enable_version_counter=False)]
     if progress:

@@ -3,7 +3,6 @@
 import copy
 import math
 
-import pytest
 import torch
 from torch import nn
 
@@ -97,7 +96,7 @@ def test_proposals_come_from_the_action_range_with_matching_densities():
 
 
 def test_actor_loss_reaches_the_actor_alone_and_critic_loss_the_critics_alone():
-    agent = make_agent(clone_weight=1.0)
+    agent = make_agent()
     batch = make_batch(agent)
     loss, _ = agent.critic_loss(batch, agent.generator)
     loss.backward()
@@ -116,16 +115,6 @@ def test_temperature_falls_when_entropy_is_above_its_target():
     for entropy, sign in ((-A + 1.0, 1.0), (-A - 1.0, -1.0)):
         (gradient,) = torch.autograd.grad(agent.temperature_loss(torch.tensor(entropy)), agent.log_alpha)
         assert math.copysign(1.0, float(gradient)) == sign
-
-
-def test_cloning_follows_only_logged_actions_that_beat_the_policy():
-    agent = make_agent(clone_weight=1.0)
-    batch = make_batch(agent, real=B // 2)
-    agent.critics.requires_grad_(False)
-    _, logs = agent.actor_loss(batch, torch.Generator().manual_seed(3))
-    action, _ = agent.actor.sample(batch["observations"], generator=torch.Generator().manual_seed(3))
-    own, logged = (agent.critics(batch["observations"], a).min(0).values for a in (action, batch["actions"]))
-    assert float(logs["better_in_log"]) == pytest.approx(float((logged > own)[: B // 2].float().mean()))
 
 
 def test_targets_move_by_their_rate():

@@ -3,7 +3,6 @@
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -14,10 +13,9 @@ from torch import Tensor, nn
 from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.ring import ImaginedRing
 from envtf_lit.data.loaders import epoch_generator
-from envtf_lit.imagination import BranchPoints, Rollouts, imagine
+from envtf_lit.imagination import Imagination, Rollouts
 from envtf_lit.params import ImaginationOptions, PolicyOptions
 from envtf_lit.policy import TanhGaussianActor
-from envtf_lit.world_models.interface import WorldModel
 
 Batch = dict[str, Tensor]
 
@@ -72,7 +70,7 @@ class OfflineAgent(L.LightningModule, ABC):
         self.ring: ImaginedRing | None = None
         if self.options.imagination is not None:
             self.ring = ImaginedRing(observation_dim, action_dim, self.options.imagination.buffer_size)
-        self._imagine: Callable[[torch.Generator], Rollouts] | None = None
+        self.imagination: Imagination | None = None
         self.reward_std = 1.0
 
     def normalise_with(self, mean: Tensor, std: Tensor) -> None:
@@ -81,26 +79,10 @@ class OfflineAgent(L.LightningModule, ABC):
             network.observation_mean.copy_(mean)
             network.observation_std.copy_(std)
 
-    def dream_with(
-        self, model: WorldModel, starts: BranchPoints, terminated: Callable[[Tensor], Tensor], first: Rollouts
-    ) -> None:
-        """Gives the agent a world model to imagine with, and the stored rollouts to begin with."""
-        assert self.ring is not None and self.options.imagination is not None
-        imagination = self.options.imagination
+    def dream_with(self, imagination: Imagination, first: Rollouts, *, reward_std: float) -> None:
+        """Gives the agent a world model, stored rollouts to begin with, and the unit of the penalty."""
+        self.imagination, self.reward_std = imagination, reward_std
         self.remember(first)
-
-        def dream(generator: torch.Generator) -> Rollouts:
-            return imagine(
-                model,
-                self.actor,
-                starts.draw(imagination.branches, imagination.history, generator),
-                horizon=imagination.horizon,
-                terminated=terminated,
-                mode=imagination.mode,
-                generator=generator,
-            )
-
-        self._imagine = dream
 
     # Lightning hooks
 
@@ -118,6 +100,8 @@ class OfflineAgent(L.LightningModule, ABC):
 
     def on_train_epoch_end(self) -> None:
         self.log_dict({f"train/{name}": torch.stack(values).mean() for name, values in self.logged.items()})
+        if self.imagination is not None and self.imagination.options.selection_episodes > 0:
+            self.log("val/imagined_return", self.imagination.imagined_return(self.average_actor))
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         o = self.options
@@ -181,8 +165,8 @@ class OfflineAgent(L.LightningModule, ABC):
         real = torch.ones(total, device=self.device)
         if imagination is None or self.ring is None:
             return batch | {"real": real}
-        if self._imagine is not None and self._refresh_now(imagination):
-            self.remember(self._imagine(self.generator))
+        if self.imagination is not None and self._refresh_now(imagination):
+            self.remember(self.imagination.rollouts(self.actor, self.generator))
         number = total - round(imagination.real_ratio * total)
         imagined = self.ring.draw(number, self.generator)
         real[total - number :] = 0.0

@@ -59,18 +59,11 @@ class CQL(OfflineAgent):
         return (pushed_down - q_data).mean(1)
 
     def actor_loss(self, batch: Batch, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        """`E[alpha log pi(a|s) - min_i Q_i(s, a)], a ~ pi(s)`, alpha held fixed, plus `clone_weight * clone_loss`."""
+        """`E[alpha log pi(a|s) - min_i Q_i(s, a)], a ~ pi(s)`, alpha held fixed."""
         action, log_density = self.actor.sample(batch["observations"], generator=generator)
-        both = self.critics(batch["observations"], torch.stack([action, batch["actions"]], 1)).min(0).values  # (B, 2)
-        q, q_logged = both[:, 0], both[:, 1]
+        q = self.critics(batch["observations"], action).min(0).values
         loss = (self.log_alpha.detach().exp() * log_density - q).mean()
-        logs = dict(q_policy=q.mean(), entropy=-log_density.mean())
-        if self.options.clone_weight > 0:
-            better = (q_logged > q).float() * batch["real"]
-            clone_loss = -(better * self.actor.log_prob(batch["observations"], batch["actions"])).sum()
-            loss = loss + self.options.clone_weight * clone_loss / batch["real"].sum()
-            logs["better_in_log"] = better.sum() / batch["real"].sum()
-        return loss, logs
+        return loss, dict(q_policy=q.mean(), entropy=-log_density.mean())
 
     def temperature_loss(self, entropy: Tensor) -> Tensor:
         """`alpha (H - H_target)`, H_target = -A (Haarnoja et al. 2018, equation 18)."""

@@ -296,7 +296,8 @@ class EnvironmentTransformer(nn.Module):
 
     def gather(self, state: TransformerState, index: Tensor) -> TransformerState:
         """See `WorldModel.gather`."""
-        cache = [(keys[index], values[index]) for keys, values in state.cache]
+        filled = min(state.clock, self.options.context)
+        cache = [(_pick(keys, index, filled), _pick(values, index, filled)) for keys, values in state.cache]
         first = None if state.first is None else state.first[index]
         return TransformerState(cache, state.clock, first, state.observation[index])
 
@@ -319,3 +320,11 @@ def _write(cache: Tensor, token: Tensor, slot: int) -> Tensor:
         cache = cache.clone()
     cache[:, :, slot] = token[:, :, 0].to(cache.dtype)
     return cache
+
+
+def _pick(cache: Tensor, index: Tensor, filled: int) -> Tensor:
+    """Rows (K,) of a cache (B, H, C, d), copying only the slots that hold a token."""
+    _, H, C, d = cache.shape
+    picked = cache.new_empty(len(index), H, C, d)
+    picked[:, :, :filled] = cache[index, :, :filled]
+    return picked
