@@ -137,7 +137,7 @@ def train_policy(
     from envtf_lit.agents.cql import CQL
     from envtf_lit.data.loaders import TransitionData
     from envtf_lit.policy import save_policy
-    from envtf_lit.training import fit, observation_scale, run_folder
+    from envtf_lit.training import fit, run_folder
 
     options: PolicyOptions = getattr(params.train_policy, algorithm)
     with _stage(f"train_policy_{algorithm}", params, root):
@@ -150,19 +150,17 @@ def train_policy(
             n_step=options.n_step,
             seed=params.seed,
         )
-        dataset = data.dataset
         agent = CQL(
             data.observation_dim,
             data.action_dim,
             options,
-            action_low=dataset.action_low.tolist(),
-            action_high=dataset.action_high.tolist(),
+            action_low=data.action_low,
+            action_high=data.action_high,
             seed=params.seed,
         )
-        agent.normalise_with(*observation_scale(torch.as_tensor(dataset.observations)))
         inputs, monitor = [root / DATASET], None
         if options.imagination is not None:
-            _give_imagination(agent, params, root, dataset)
+            _give_imagination(agent, params, root, data.dataset)
             inputs += [root / WORLD_MODEL, root / ROLLOUTS]
             monitor = "val/imagined_return" if options.imagination.selection_episodes > 0 else None
         key = _key(params, asdict(options))
@@ -175,6 +173,7 @@ def train_policy(
             progress=progress,
             monitor=monitor,
             mode="max",
+            validate=False,
         )
         kept = max(curves.rows, key=lambda row: row[monitor]) if monitor else curves.rows[-1]
         metrics = {name.rpartition("/")[2]: value for name, value in kept.items()}

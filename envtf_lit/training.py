@@ -73,6 +73,7 @@ def fit(
     precision: Precision,
     progress: bool = True,
     monitor: str | None = None,
+    validate: bool = True,
     mode: Literal["min", "max"] = "min",
     gradient_clip: float | None = None,
 ) -> Curves:
@@ -82,6 +83,7 @@ def fit(
         module: holds its final weights afterwards, or with `monitor` those of the epoch where it was best.
         run: folder of the resumable checkpoints, removed at the end.
         monitor: logged name to select the kept weights by.
+        validate: run the validation loop after each epoch.
         mode: whether the least or the largest value of `monitor` is best.
         gradient_clip: largest gradient norm, for automatic optimisation alone.
     """
@@ -104,6 +106,7 @@ def fit(
         enable_progress_bar=progress,
         enable_model_summary=False,
         num_sanity_val_steps=0,
+        limit_val_batches=None if validate else 0,
         gradient_clip_val=gradient_clip,
     )
     checkpoint = run / "last.ckpt"

@@ -12,10 +12,12 @@ from torch import Tensor, nn
 
 from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.ring import ImaginedRing
-from envtf_lit.data.loaders import epoch_generator
+from envtf_lit.data.loaders import TransitionData, epoch_generator
 from envtf_lit.imagination import Imagination, Rollouts
 from envtf_lit.params import ImaginationOptions, PolicyOptions
 from envtf_lit.policy import TanhGaussianActor
+from envtf_lit.storage import load_weights
+from envtf_lit.training import observation_scale
 
 Batch = dict[str, Tensor]
 
@@ -27,6 +29,14 @@ class OfflineAgent(L.LightningModule, ABC):
     imagination, `1 - real_ratio` of each B rows is replaced by rows of the imagined ring.
 
     Logged names are explained in docs/metrics.md.
+
+    Args:
+        observation_dim: S.
+        action_dim: A.
+        options: of the networks and of the optimisation; a plain dictionary when read from a checkpoint.
+        action_low, action_high: (A,), None for [-1, 1].
+        seed: of everything random.
+        init_from: a published policy folder whose actor to start from. The warm start then fits the critics alone.
     """
 
     log_alpha: nn.Parameter
@@ -39,6 +49,7 @@ class OfflineAgent(L.LightningModule, ABC):
         action_low: list[float] | None = None,
         action_high: list[float] | None = None,
         seed: int = 0,
+        init_from: str | None = None,
     ) -> None:
         super().__init__()
         self.options = _policy_options(options)
@@ -53,7 +64,7 @@ class OfflineAgent(L.LightningModule, ABC):
             )
         )
         self.automatic_optimization = False
-        self.seed = seed
+        self.seed, self.init_from = seed, init_from
         self.actor = TanhGaussianActor(
             observation_dim, action_dim, hidden=self.options.hidden, action_low=action_low, action_high=action_high
         )
@@ -86,6 +97,15 @@ class OfflineAgent(L.LightningModule, ABC):
 
     # Lightning hooks
 
+    def setup(self, stage: str) -> None:
+        """Takes the observation scale from the dataset, or the actor's, with its weights, from `init_from`."""
+        data: TransitionData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
+        self.normalise_with(*observation_scale(torch.as_tensor(data.dataset.observations)))
+        if self.init_from is not None:
+            for actor in (self.actor, self.average_actor):
+                load_weights(actor, f"{self.init_from}/weights.safetensors")
+        self.return_variance = data.transitions.columns["returns"].var(correction=0).clamp(min=1e-12).item()
+
     def on_train_epoch_start(self) -> None:
         self.generator = epoch_generator(self.seed, self.current_epoch, "agent")
         self.update_index = self.current_epoch * self.options.updates_per_epoch
@@ -102,6 +122,16 @@ class OfflineAgent(L.LightningModule, ABC):
         self.log_dict({f"train/{name}": torch.stack(values).mean() for name, values in self.logged.items()})
         if self.imagination is not None and self.imagination.options.selection_episodes > 0:
             self.log("val/imagined_return", self.imagination.imagined_return(self.average_actor))
+
+    def validation_step(self, batch: Batch, batch_index: int) -> None:
+        q = self.critics(batch["observations"], batch["actions"]).min(0).values
+        action = self.average_actor.act(batch["observations"])
+        logs = dict(
+            q_data=q.mean(),
+            return_error=(q - batch["returns"]).square().mean() / self.return_variance,
+            action_error=(action - batch["actions"]).square().mean(),
+        )
+        self.log_dict({f"val/{name}": value for name, value in logs.items()}, batch_size=len(q))
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         o = self.options
@@ -129,13 +159,14 @@ class OfflineAgent(L.LightningModule, ABC):
         return logs | actor_logs | dict(alpha=self.log_alpha.exp())
 
     def warm_up(self, batch: Batch) -> dict[str, Tensor]:
-        """Critics regress on Monte-Carlo returns of the log, the actor clones it."""
+        """Critics regress on Monte-Carlo returns of the log; the actor clones it, unless it began from `init_from`."""
         actor_optimizer, critic_optimizer, _ = self._optimizers()
         q = self.critics(batch["observations"], batch["actions"])
         critic_loss = 0.5 * (q - batch["returns"]).square().mean(1).sum()
         _descend(self, critic_optimizer, critic_loss)
         clone_loss = -self.actor.log_prob(batch["observations"], batch["actions"]).mean()
-        _descend(self, actor_optimizer, clone_loss)
+        if self.init_from is None:
+            _descend(self, actor_optimizer, clone_loss)
         if self.update_index == self.options.warm_start - 1:
             self.target_critics.load_state_dict(self.critics.state_dict())
             self.average_actor.load_state_dict(self.actor.state_dict())

@@ -1,5 +1,6 @@
 """Behaviour cloning: the policy of the log, by maximum likelihood. The baseline, and who imagines first."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -45,17 +46,19 @@ def clone_behaviour(
     data = TransitionData(
         str(path), batch_size=options.clone_batch_size, steps_per_epoch=CLONE_STEPS_PER_EPOCH, seed=seed
     )
-    dataset = data.dataset
     actor = TanhGaussianActor(
         data.observation_dim,
         data.action_dim,
-        action_low=dataset.action_low.tolist(),
-        action_high=dataset.action_high.tolist(),
+        action_low=data.action_low,
+        action_high=data.action_high,
     )
-    mean, std = observation_scale(torch.as_tensor(dataset.observations))
+    mean, std = observation_scale(torch.as_tensor(data.dataset.observations))
     actor.observation_mean.copy_(mean)
     actor.observation_std.copy_(std)
     updates_per_epoch = CLONE_STEPS_PER_EPOCH * data.updates_per_step
     epochs = max(1, round(options.clone_updates / updates_per_epoch))
-    curves = fit(BehaviourClone(actor), data, run=run, epochs=epochs, precision=precision, progress=progress)
+    clone = BehaviourClone(actor)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*have no `validation_step`")  # the data offer more than a clone needs
+        curves = fit(clone, data, run=run, epochs=epochs, precision=precision, progress=progress, validate=False)
     return actor.eval(), curves

@@ -5,6 +5,7 @@ one that was never interrupted.
 """
 
 from collections.abc import Iterable, Iterator
+from functools import cached_property
 
 import lightning as L
 import numpy as np
@@ -163,6 +164,10 @@ class WindowData(L.LightningDataModule):
         windows = Windows(self.held_out, self.context)
         return _loader(windows, windows.tiles().split(256))
 
+    def test_dataloader(self) -> DataLoader[dict[str, Tensor]]:
+        """The same rows as in validation: no third split."""
+        return self.val_dataloader()
+
 
 class TransitionData(L.LightningDataModule):
     """Transitions for agents, several batches at a time.
@@ -192,10 +197,19 @@ class TransitionData(L.LightningDataModule):
         self.discount, self.n_step, self.seed = discount, n_step, seed
         self.dataset = load_dataset(path)
         self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
+        self.action_low, self.action_high = self.dataset.action_low.tolist(), self.dataset.action_high.tolist()
+
+    @cached_property
+    def transitions(self) -> Transitions:
+        """All rows of the dataset, with their n-step targets and returns to go."""
+        return Transitions(self.dataset, discount=self.discount, n_step=self.n_step)
 
     def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
         """Batches (updates_per_step, batch_size, …) of `Transitions`."""
-        transitions = Transitions(self.dataset, discount=self.discount, n_step=self.n_step)
         shape = (self.updates_per_step, self.batch_size)
-        sampler = DrawSampler(len(transitions), shape, self.steps_per_epoch, seed=self.seed)
-        return _loader(transitions, sampler)
+        sampler = DrawSampler(len(self.transitions), shape, self.steps_per_epoch, seed=self.seed)
+        return _loader(self.transitions, sampler)
+
+    def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:
+        """Each row once, in the log's order, in batches (4096, …)."""
+        return _loader(self.transitions, torch.arange(len(self.transitions)).split(4096))

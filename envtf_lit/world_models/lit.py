@@ -70,6 +70,12 @@ class LitWorldModel(L.LightningModule):
         error = open_loop_error(self.model, self.segments, self.scale)
         self.log("val/open_loop_error", error, prog_bar=True)
 
+    def test_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
+        self.log("test/loss", self.model.loss(batch), batch_size=int(batch["mask"].sum()))
+
+    def on_test_epoch_end(self) -> None:
+        self.log("test/open_loop_error", open_loop_error(self.model, self.segments, self.scale))
+
     def configure_optimizers(self) -> dict[str, Any]:
         o = self.options
         matrices = [p for p in self.model.parameters() if p.dim() >= 2]
