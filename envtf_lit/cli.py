@@ -2,6 +2,7 @@
 
 import argparse
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -9,7 +10,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-from envtf_lit.errors import UserError
+from envtf_lit.errors import DISK_FULL, UserError
 
 # what each stage does, and the parts of params.yaml that its help explains
 STAGES = {
@@ -37,11 +38,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _run(arguments)
     except UserError as error:
         _fail(str(error), 2)
+    except OSError as error:
+        if error.errno not in DISK_FULL:
+            raise
+        _fail(f"No space left on the disk ({error}): free some and run the same command again.", 2)
     except KeyboardInterrupt:
         _fail("Interrupted. The same command continues training from the last finished epoch.", 130)
 
 
 def _run(arguments: list[str]) -> None:
+    # Lightning's use of an older torch's name helps nobody
+    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
     if arguments and arguments[0] in LIGHTNING:
         from envtf_lit.lightning_cli import run
 
@@ -131,15 +138,15 @@ def _stage(namespace: argparse.Namespace, rest: list[str]) -> None:
     from envtf_lit import pipeline
 
     _hush_lightning()
+    os.environ.pop("MUJOCO_GL", None)  # a back end that is missing breaks `import mujoco`; videos probe for their own
     extra = {"algorithm": namespace.algorithm} if namespace.command == "train_policy" else {}
     metrics = getattr(pipeline, namespace.command)(params, **extra, progress=not namespace.quiet)
     Console().print_json(data=metrics)
 
 
 def _hush_lightning() -> None:
-    """A stage shows progress and a result; Lightning's hints, and its use of an older torch's names, help nobody."""
+    """A stage shows progress and a result; Lightning's hints help nobody."""
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
 
 
 def flags_to_overrides(flags: Sequence[str]) -> list[str]:

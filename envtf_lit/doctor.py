@@ -64,6 +64,7 @@ def _memory_gib() -> float:
 
 
 def _rendering() -> str:
+    os.environ.pop("MUJOCO_GL", None)  # a back end that is missing breaks `import mujoco`
     from envtf_lit.figures.video import working_backend
 
     backend = working_backend()

@@ -1,7 +1,10 @@
 """The one exception that users are meant to read, and the "did you mean" that goes with it."""
 
 import difflib
+import errno
 from collections.abc import Iterable
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # no space, none left in the quota, above the size limit
 
 
 class UserError(ValueError):

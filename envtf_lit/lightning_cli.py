@@ -1,18 +1,32 @@
 """`envtf model …` and `envtf agent …`: LightningCLI over the classes that the pipeline trains."""
 
+import json
 import warnings
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from rich.console import Console
 
 from envtf_lit.agents.cql import CQL
 from envtf_lit.data.loaders import TransitionData, WindowData
+from envtf_lit.errors import UserError
 from envtf_lit.params import PolicyOptions, TrainModelOptions
+from envtf_lit.policy import save_policy
+from envtf_lit.storage import replacing
 from envtf_lit.world_models.lit import LitWorldModel
+from envtf_lit.world_models.store import save_world_model
 
 TRUST = (
     "A --config file is trusted like code: it may name any class to run, so take one only from where you would take a "
-    "program. Weights (--model.init_from) hold data alone."
+    "program. Weights (--model.init_from) and checkpoints (--ckpt_path) are read as data alone. A run continued with "
+    "--ckpt_path keeps the checkpoint's options where no flag says otherwise: to train on for longer, add "
+    "--model.options.updates N, or --trainer.max_epochs N to leave the learning-rate schedule as it is. After fit, the "
+    "weights of the last update lie in the folder `published`, whose path is printed."
 )
 
 
@@ -30,7 +44,7 @@ def world_model(
         action_dim: A, taken from the data.
         options: as train_model in params.yaml.
         seed: of dropout and of sampled objectives.
-        init_from: a published model folder whose weights to start from.
+        init_from: a published model folder (as models/world_model) whose weights and scales to start from.
     """
     return LitWorldModel(observation_dim, action_dim, options, seed, init_from)
 
@@ -39,7 +53,10 @@ def agent(
     observation_dim: int,
     action_dim: int,
     options: PolicyOptions = PolicyOptions(),  # noqa: B008 (frozen)
+    action_low: list[float] | None = None,
+    action_high: list[float] | None = None,
     seed: int = 0,
+    init_from: str | None = None,
 ) -> CQL:
     """Conservative Q-Learning on a log alone.
 
@@ -47,19 +64,51 @@ def agent(
         observation_dim: S, taken from the data.
         action_dim: A, taken from the data.
         options: as train_policy.cql in params.yaml.
+        action_low: (A,), taken from the data.
+        action_high: (A,), taken from the data.
         seed: of everything random.
+        init_from: a published policy folder (as models/policy/cql) whose actor to start from; such folders hold no
+            critics, so these start anew, and the warm start fits them alone.
     """
-    return CQL(observation_dim, action_dim, options, seed=seed)
+    return CQL(observation_dim, action_dim, options, action_low, action_high, seed, init_from)
+
+
+class Publish(Callback):
+    """Writes what was trained as a model folder, for `load_world_model` or `load_policy`, beside the run's logs."""
+
+    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        folder = _folder(trainer) / "published"
+        if isinstance(pl_module, LitWorldModel):
+            save_world_model(folder, pl_module.model)
+        elif isinstance(pl_module, CQL):
+            save_policy(folder, pl_module.average_actor)
+        Console().print(f"Published the weights of the last update: {folder}", highlight=False, soft_wrap=True)
+
+
+class KeepConfig(SaveConfigCallback):
+    """Writes the whole configuration to `config.yaml` beside the run's logs, wherever the logger keeps them."""
+
+    def save_config(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        with replacing(_folder(trainer) / "config.yaml") as temporary:
+            self.parser.save(self.config, str(temporary), skip_none=False, multifile=False)
+
+
+def _folder(trainer: L.Trainer) -> Path:
+    """The run's own folder; not every logger has one."""
+    return Path(trainer.log_dir or trainer.default_root_dir)
 
 
 class _LinkedCLI(LightningCLI):
     """Takes dimensions from the dataset, asks only once for what model and data share, and stops when updates say."""
 
+    from_data: tuple[str, ...] = ("observation_dim", "action_dim")
     links: dict[str, str]
     verbs: tuple[str, ...]
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        for name in ("observation_dim", "action_dim"):
+        for name in self.from_data:
             parser.link_arguments(f"data.{name}", f"model.{name}", apply_on="instantiate")
         for source, target in self.links.items():
             parser.link_arguments(source, target)
@@ -75,9 +124,18 @@ class _LinkedCLI(LightningCLI):
         with warnings.catch_warnings():  # these are this command's arguments, whatever stands in sys.argv
             warnings.filterwarnings("ignore", "LightningCLI's args parameter")
             super().parse_arguments(parser, args)
+            verb = self.config.subcommand
+            checkpoint = self.config[verb].ckpt_path
+            if checkpoint is not None:  # below any --config and flag: parsed as the first --config
+                begin, saved = args.index(verb) + 1, {"model": _saved_options(checkpoint)}
+                super().parse_arguments(parser, [*args[:begin], "--config", json.dumps(saved), *args[begin:]])
+
+    def _parse_ckpt_path(self) -> None:
+        """Lightning would let the checkpoint's options win over flags; see `parse_arguments`."""
 
     def before_instantiate_classes(self) -> None:
         config = self.config[str(self.subcommand)]
+        config.weights_only = True  # checkpoints are data
         options, trainer = config.model.options, config.trainer
         if trainer.max_epochs is None and trainer.max_steps == -1:
             trainer.max_epochs = max(1, options.updates // options.updates_per_epoch)
@@ -102,10 +160,12 @@ class AgentCLI(_LinkedCLI):
     """`envtf agent`."""
 
     verbs = ("fit", "validate")
+    from_data = ("observation_dim", "action_dim", "action_low", "action_high")
     links = {
         "model.options.batch_size": "data.batch_size",
         "model.options.updates_per_step": "data.updates_per_step",
         "model.options.discount": "data.discount",
+        "model.options.n_step": "data.n_step",
         "model.seed": "data.seed",
     }
 
@@ -114,8 +174,53 @@ class AgentCLI(_LinkedCLI):
         parser.link_arguments(updates, "data.steps_per_epoch", compute_fn=lambda epoch, step: max(1, epoch // step))
 
 
+def _saved_options(checkpoint: str) -> dict[str, Any]:
+    """The options and the seed that a Lightning checkpoint was trained with.
+
+    Raises:
+        UserError: the file is missing or is not such a checkpoint.
+    """
+    try:
+        saved = torch.load(checkpoint, map_location="cpu", weights_only=True)["hyper_parameters"]
+        return {name: saved[name] for name in ("options", "seed")}
+    except FileNotFoundError:
+        raise UserError(f"{checkpoint} does not exist: give --ckpt_path a checkpoint of an earlier fit.") from None
+    except Exception:  # whatever unpickling raises; torch's own message recommends to run code found in the file
+        raise UserError(
+            f"{checkpoint} is not a checkpoint of this model: give --ckpt_path a file that fit wrote."
+        ) from None
+
+
 def run(kind: str, arguments: list[str]) -> None:
-    """Runs `envtf model ARGUMENTS` or `envtf agent ARGUMENTS`."""
+    """Runs `envtf model ARGUMENTS` or `envtf agent ARGUMENTS`.
+
+    Raises:
+        UserError: bad data, weights or checkpoints, or a logger that is not installed.
+    """
+    try:
+        _run(kind, arguments)
+    except (ModuleNotFoundError, ValueError) as error:  # jsonargparse wraps what a logger raises
+        missing = next((e for e in _causes(error) if isinstance(e, ModuleNotFoundError)), None)
+        if missing is None:
+            raise
+        raise UserError(f"A package is missing: {' '.join(str(missing).split())}") from None
+    except RuntimeError as error:
+        head, *mismatches = str(error).splitlines()
+        if not head.startswith("Error(s) in loading state_dict"):
+            raise
+        raise UserError(
+            f"The checkpoint does not fit the model ({' '.join(mismatches[0].split())}): leave out the flags that "
+            "change the architecture, which --ckpt_path brings along."
+        ) from None
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__
+
+
+def _run(kind: str, arguments: list[str]) -> None:
     cli, model, data = {"model": (ModelCLI, world_model, WindowData), "agent": (AgentCLI, agent, TransitionData)}[kind]
     cli(
         model,
@@ -123,7 +228,8 @@ def run(kind: str, arguments: list[str]) -> None:
         args=arguments,
         seed_everything_default=0,
         auto_configure_optimizers=False,
-        trainer_defaults={"default_root_dir": ".envtf"},
-        save_config_kwargs={"overwrite": True},
+        trainer_defaults={"default_root_dir": ".envtf", "callbacks": [Publish()]},
+        save_config_callback=KeepConfig,
+        save_config_kwargs={"save_to_log_dir": False},
         parser_kwargs={"prog": f"envtf {kind}", "description": f"{(model.__doc__ or '').splitlines()[0]} {TRUST}"},
     )

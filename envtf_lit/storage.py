@@ -12,10 +12,10 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import nn
 
-from envtf_lit.errors import UserError, did_you_mean
+from envtf_lit.errors import DISK_FULL, UserError, did_you_mean
 
 
 @contextlib.contextmanager
@@ -36,7 +36,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
             shutil.rmtree(path)
         os.replace(temporary, path)
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if error.errno in DISK_FULL:
             raise UserError(f"No space left while writing {path}: free some disk space and run again.") from error
         if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
             raise UserError(f"Cannot write {path}: {error.strerror}; choose a folder you may write to.") from error
@@ -79,7 +79,7 @@ def save_module(folder: str | Path, module: nn.Module, *, kind: str, arguments: 
     with replacing(folder) as temporary:
         temporary.mkdir()
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in module.state_dict().items()}
-        save_file(tensors, temporary / "weights.safetensors")
+        (temporary / "weights.safetensors").write_bytes(save(tensors))  # so that a full disk is an OSError
         write_json(temporary / "config.json", {"kind": kind, "arguments": dict(arguments)})
 
 
