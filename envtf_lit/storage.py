@@ -99,7 +99,7 @@ def load_module(folder: str | Path, registry: Mapping[str, type[nn.Module]]) -> 
         raise UserError(f"{folder}/config.json names the unknown kind {kind!r}: {did_you_mean(kind, registry)}")
     try:
         module = registry[kind](**config["arguments"])
-    except (TypeError, KeyError, ValueError) as error:
+    except (TypeError, KeyError, ValueError, RuntimeError) as error:  # the last: torch, of impossible sizes
         raise UserError(f"{folder}/config.json does not describe a {kind} ({error}): save the model anew.") from None
     load_weights(module, folder / "weights.safetensors")
     return module.eval()

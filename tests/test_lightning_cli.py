@@ -1,0 +1,239 @@
+"""`envtf model …` and `envtf agent …`: what comes from the data, from folders, from checkpoints, and where it goes."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+
+from envtf_lit import load_policy, load_world_model, pipeline
+from envtf_lit.agents.cql import CQL
+from envtf_lit.cli import main
+from envtf_lit.data.formats import save_dataset
+from envtf_lit.data.loaders import TransitionData, Transitions
+from envtf_lit.params import Params, PolicyOptions
+from tests.walker import walker_dataset
+
+SIZES = {
+    "model": {"model.layers": 1, "model.heads": 2, "model.width": 16, "model.context": 4, "batch_size": 8},
+    "agent": {"hidden": [8], "updates_per_step": 2, "warm_start": 2, "batch_size": 8},
+}
+RUN = {"updates_per_epoch": 2, "updates": 4}
+QUIET = ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
+NO_LOGGER = "--trainer.logger=false"
+
+# Lightning 2.6's use of an older jsonargparse's names
+pytestmark = pytest.mark.filterwarnings("ignore::jsonargparse._deprecated.JsonargparseDeprecationWarning")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A project whose dataset has actions in [-2, 2]."""
+    limit = np.full(3, 2.0, np.float32)
+    save_dataset(replace(walker_dataset(), action_low=-limit, action_high=limit), tmp_path / "data/dataset.h5")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def envtf(kind: str, verb: str, *flags: str, **options: object) -> None:
+    """Runs a Lightning command line on the project's dataset."""
+    named = [f"--model.options.{name.replace('__', '.')}={value}" for name, value in options.items()]
+    main([kind, verb, "--data.path", "data/dataset.h5", *QUIET, *named, *flags])
+
+
+def fit(kind: str, *flags: str, **options: object) -> None:
+    envtf(kind, "fit", NO_LOGGER, *flags, **{**SIZES[kind], **RUN, **options})
+
+
+def refused(capsys: pytest.CaptureFixture[str], kind: str, verb: str, *flags: str, **options: object) -> str:
+    """The one sentence with which a command ends in status 2."""
+    with pytest.raises(SystemExit) as stop:
+        envtf(kind, verb, *flags, **options)
+    assert stop.value.code == 2
+    errors = capsys.readouterr().err.strip().splitlines()
+    assert "Traceback" not in "\n".join(errors)
+    return errors[-1]
+
+
+def same(first: torch.nn.Module, second: torch.nn.Module) -> bool:
+    a, b = first.state_dict(), second.state_dict()
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+# what the pipeline and the command line share
+
+
+def test_an_agents_validation_against_plain_numbers(folder: Path) -> None:
+    torch.manual_seed(0)
+    data = TransitionData("data/dataset.h5", discount=0.9)
+    agent = CQL(data.observation_dim, data.action_dim, PolicyOptions(hidden=(8,), discount=0.9))
+    trainer = L.Trainer(logger=False, enable_progress_bar=False, enable_model_summary=False)
+    (logged,) = trainer.validate(agent, data, verbose=False)
+    rows = Transitions(data.dataset, discount=0.9).columns
+    q = agent.critics(rows["observations"], rows["actions"]).min(0).values.detach().numpy()
+    returns, action = rows["returns"].numpy(), agent.average_actor.act(rows["observations"]).numpy()
+    assert logged == pytest.approx(
+        {
+            "val/q_data": q.mean(),
+            "val/return_error": np.mean((q - returns) ** 2) / np.var(returns),
+            "val/action_error": np.mean((action - data.dataset.actions) ** 2),
+        },
+        rel=1e-4,
+    )
+    assert torch.equal(agent.critics.observation_mean, rows["observations"].double().mean(0).float())
+
+
+def test_the_pipeline_spends_no_time_on_validating_agents(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(CQL, "validation_step", never)
+    cql = PolicyOptions(updates=4, updates_per_epoch=2, updates_per_step=2, batch_size=8, hidden=(8,), warm_start=2)
+    params = Params(threads=1)
+    params = replace(params, train_policy=replace(params.train_policy, cql=cql))
+    metrics = pipeline.train_policy(params, algorithm="cql", progress=False)
+    assert "return_error" not in metrics
+
+
+# published folders
+
+
+def test_agent_fit_publishes_a_policy_with_the_datas_scale_and_limits(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit("agent")
+    assert ".envtf/published" in capsys.readouterr().out
+    policy, dataset = load_policy(".envtf/published"), TransitionData("data/dataset.h5").dataset
+    assert policy.action_low.tolist() == [-2.0] * 3 and policy.action_high.tolist() == [2.0] * 3
+    np.testing.assert_allclose(policy.observation_mean, dataset.observations.mean(0), atol=1e-6)
+    (checkpoint,) = Path(".envtf").rglob("*.ckpt")
+    saved = torch.load(checkpoint, weights_only=True)
+    assert saved["hyper_parameters"]["action_low"] == [-2.0] * 3
+    assert all(torch.equal(saved["state_dict"][f"average_actor.{k}"], v) for k, v in policy.state_dict().items())
+
+
+def test_model_fit_publishes_and_starts_from_published_weights(folder: Path) -> None:
+    fit("model")
+    Path(".envtf/published").rename("first")
+    fit("model", "--model.init_from=first", "--model.seed=1", learning_rate=0)
+    assert same(load_world_model("first"), load_world_model(".envtf/published"))
+    fit("model", "--model.init_from=first", "--model.seed=1")
+    assert not same(load_world_model("first"), load_world_model(".envtf/published"))
+
+
+def test_agent_fit_starts_its_actor_from_a_published_policy_and_warms_up_critics_alone(folder: Path) -> None:
+    fit("agent")
+    Path(".envtf/published").rename("first")
+    fit("agent", "--model.init_from=first", "--model.seed=1", warm_start=4)
+    assert same(load_policy("first"), load_policy(".envtf/published"))
+    fit("agent", "--model.init_from=first", "--model.seed=1", warm_start=0)
+    assert not same(load_policy("first"), load_policy(".envtf/published"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "sentence"),
+    [
+        ("model", {"model.width": 8}, "first/weights.safetensors does not fit the model"),
+        ("agent", {"hidden": [9]}, "first/weights.safetensors does not fit the model"),
+    ],
+)
+def test_weights_of_another_shape_are_refused(
+    kind: str, change: dict[str, object], sentence: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit(kind)
+    Path(".envtf/published").rename("first")
+    options = {**SIZES[kind], **RUN, **change}
+    assert sentence in refused(capsys, kind, "fit", NO_LOGGER, "--model.init_from=first", **options)
+    missing = refused(capsys, kind, "fit", NO_LOGGER, "--model.init_from=nowhere", **options)
+    assert "nowhere/weights.safetensors does not exist" in missing
+
+
+# checkpoints
+
+
+@pytest.mark.parametrize("kind", ["model", "agent"])
+def test_a_continued_run_keeps_the_checkpoints_options_where_no_flag_differs(kind: str, folder: Path) -> None:
+    fit(kind, "--model.seed=3")
+    (checkpoint,) = Path(".envtf").rglob("*.ckpt")
+    envtf(kind, "fit", NO_LOGGER, f"--ckpt_path={checkpoint}", updates=8)
+    (longer,) = set(Path(".envtf").rglob("*.ckpt")) - {checkpoint}
+    before, after = (torch.load(path, weights_only=True) for path in (checkpoint, longer))
+    assert (before["epoch"], after["epoch"]) == (1, 3)
+    assert after["hyper_parameters"].pop("options") == before["hyper_parameters"].pop("options") | {"updates": 8}
+    assert after["hyper_parameters"] == before["hyper_parameters"] and before["hyper_parameters"]["seed"] == 3
+
+
+@pytest.mark.parametrize("kind", ["model", "agent"])
+def test_a_continued_run_equals_an_uninterrupted_one(kind: str, folder: Path) -> None:
+    fit(kind, "--trainer.max_epochs=1")
+    (checkpoint,) = Path(".envtf").rglob("*.ckpt")
+    envtf(kind, "fit", NO_LOGGER, f"--ckpt_path={checkpoint}")
+    resumed = Path(".envtf/published/weights.safetensors").read_bytes()
+    fit(kind)
+    assert Path(".envtf/published/weights.safetensors").read_bytes() == resumed
+
+
+def test_model_test_equals_validate_and_needs_no_options_beside_the_checkpoint(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit("model")
+    (checkpoint,) = Path(".envtf").rglob("*.ckpt")
+    numbers = {}
+    for verb, prefix in (("validate", "val"), ("test", "test")):
+        capsys.readouterr()
+        envtf("model", verb, NO_LOGGER, f"--ckpt_path={checkpoint}")
+        words = capsys.readouterr().out.replace("│", " ").split()
+        numbers[verb] = [words[words.index(f"{prefix}/{name}") + 1] for name in ("loss", "open_loop_error")]
+    assert numbers["validate"] == numbers["test"] and float(numbers["test"][0]) > 0
+
+
+def test_checkpoints_that_do_not_fit_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fit("model")
+    (checkpoint,) = Path(".envtf").rglob("*.ckpt")
+    assert "does not exist" in refused(capsys, "model", "fit", "--ckpt_path=nowhere.ckpt")
+    assert "not a checkpoint" in refused(capsys, "model", "fit", "--ckpt_path=data/dataset.h5")
+    changed = refused(capsys, "model", "fit", NO_LOGGER, f"--ckpt_path={checkpoint}", **{"model.width": 8})
+    assert "does not fit the model" in changed and "change the architecture" in changed
+
+
+def test_a_saved_config_is_a_config(folder: Path) -> None:
+    fit("agent")
+    published = Path(".envtf/published/weights.safetensors")
+    first = published.read_bytes()
+    published.unlink()
+    Path(".envtf/config.yaml").rename("again.yaml")
+    main(["agent", "fit", "--config", "again.yaml"])
+    assert published.read_bytes() == first
+
+
+# loggers
+
+
+@pytest.mark.parametrize(
+    ("flags", "written"),
+    [
+        (["CSVLogger", "--trainer.logger.save_dir=logs"], "logs/lightning_logs/version_0/metrics.csv"),
+        (["dvclive.lightning.DVCLiveLogger", "--trainer.logger.dvcyaml=null"], "dvclive/plots/metrics/val/loss.tsv"),
+        (["TensorBoardLogger", "--trainer.logger.save_dir=logs"], "logs/lightning_logs/version_0/events.out.*"),
+    ],
+)
+def test_loggers(flags: list[str], written: str, folder: Path) -> None:
+    if flags[0].startswith("TensorBoard"):
+        pytest.importorskip("tensorboard")
+    envtf("model", "fit", f"--trainer.logger={flags[0]}", *flags[1:], **{**SIZES["model"], **RUN})
+    (file,) = folder.glob(written)
+    assert file.stat().st_size > 0
+    (weights,) = folder.rglob("published/weights.safetensors")
+    assert json.loads((weights.parent / "config.json").read_text())["kind"] == "environment_transformer"
+    assert list(folder.rglob("config.yaml"))
+
+
+@pytest.mark.skipif(find_spec("wandb") is not None, reason="W&B is installed")
+def test_a_logger_that_is_not_installed_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sentence = refused(capsys, "model", "fit", "--trainer.logger=WandbLogger", **{**SIZES["model"], **RUN})
+    assert "wandb" in sentence and "pip install" in sentence

@@ -1,0 +1,121 @@
+"""Model folders: what is damaged, foreign or too large for the disk ends in one sentence, and nothing half-written."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from envtf_lit.errors import UserError
+from envtf_lit.params import ModelOptions
+from envtf_lit.policy import TanhGaussianActor, load_policy, save_policy
+from envtf_lit.storage import load_weights, write_json
+from envtf_lit.world_models.store import load_world_model, save_world_model
+from envtf_lit.world_models.transformer import EnvironmentTransformer
+
+
+@pytest.fixture
+def policy(tmp_path: Path) -> Path:
+    save_policy(tmp_path / "policy", TanhGaussianActor(3, 2, hidden=(8,)))
+    return tmp_path / "policy"
+
+
+def change_arguments(folder: Path, **changes: object) -> None:
+    config = json.loads((folder / "config.json").read_text())
+    config["arguments"].update(changes)
+    write_json(folder / "config.json", config)
+
+
+def test_what_was_saved_comes_back(policy: Path) -> None:
+    again = load_policy(policy)
+    save_policy(policy.with_name("again"), again)
+    for name in ("weights.safetensors", "config.json"):
+        assert (policy / name).read_bytes() == (policy.with_name("again") / name).read_bytes()
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no weights": (lambda f: (f / "weights.safetensors").unlink(), r"weights\.safetensors does not exist"),
+    "no config": (lambda f: (f / "config.json").unlink(), r"config\.json does not exist"),
+    "pickle": (lambda f: torch.save({}, f / "weights.safetensors"), "is not a safetensors file"),
+    "cut weights": (lambda f: os.truncate(f / "weights.safetensors", 300), "is not a safetensors file"),
+    "cut config": (lambda f: os.truncate(f / "config.json", 40), "is not valid JSON"),
+    "empty config": (lambda f: (f / "config.json").write_text(""), "is not valid JSON"),
+    "binary config": (lambda f: (f / "config.json").write_bytes(b"\xff\xfe"), "is not valid JSON"),
+    "a list": (lambda f: write_json(f / "config.json", [1]), "unknown kind ''"),
+    "no arguments": (lambda f: write_json(f / "config.json", {"kind": "tanh_gaussian"}), "does not describe"),
+    "a class path": (lambda f: write_json(f / "config.json", {"kind": "os.system"}), "unknown kind 'os.system'"),
+    "odd argument": (lambda f: change_arguments(f, colour="red"), "does not describe a tanh_gaussian"),
+    "text for a number": (lambda f: change_arguments(f, observation_dim="x"), "does not describe a tanh_gaussian"),
+    "impossible size": (lambda f: change_arguments(f, observation_dim=-1), "does not describe a tanh_gaussian"),
+    "other shape": (lambda f: change_arguments(f, hidden=[9]), r"net\.0\.bias has shape \(8,\) in the file and \(9,\)"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_folder_is_refused_in_a_sentence(policy: Path, damage: str) -> None:
+    break_it, sentence = DAMAGE[damage]
+    break_it(policy)
+    with pytest.raises(UserError, match=sentence) as caught:
+        load_policy(policy)
+    assert str(policy) in str(caught.value)
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"nowhere is not a model folder: it does not exist"):
+        load_policy(tmp_path / "nowhere")
+
+
+def test_each_loader_takes_its_own_kind_alone(policy: Path, tmp_path: Path) -> None:
+    options = ModelOptions(layers=1, heads=1, width=4, context=2)
+    model = EnvironmentTransformer(3, 2, **vars(options))
+    save_world_model(tmp_path / "model", model)
+    with pytest.raises(UserError, match="unknown kind 'environment_transformer'"):
+        load_policy(tmp_path / "model")
+    with pytest.raises(UserError, match="unknown kind 'tanh_gaussian'"):
+        load_world_model(policy)
+    with pytest.raises(UserError, match="does not fit the model"):
+        load_weights(model, policy / "weights.safetensors")
+
+
+FULL_DISK = """
+import os, resource
+from pathlib import Path
+import torch
+from envtf_lit.data.formats import save_dataset
+from envtf_lit.errors import UserError
+from envtf_lit.policy import TanhGaussianActor, save_policy
+from envtf_lit.storage import write_json
+from tests.walker import walker_dataset
+
+dataset, actor = walker_dataset(episodes=100), TanhGaussianActor(30, 20)
+save_policy("policy", TanhGaussianActor(3, 2, hidden=(8,)))
+before = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # every larger file fails as on a full disk
+writers = {
+    "a model": lambda: save_policy("policy", actor),
+    "JSON": lambda: write_json("numbers.json", list(range(10_000))),
+    "HDF5": lambda: save_dataset(dataset, "data.h5"),
+    "NPZ": lambda: save_dataset(dataset, "data.npz"),
+}
+for name, write in writers.items():
+    try:
+        write()
+    except UserError as error:
+        assert str(error).startswith("No space left while writing"), error
+    else:
+        raise SystemExit(f"{name} was written whole")
+assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before
+"""
+
+
+def test_a_full_disk_leaves_what_was_there(tmp_path: Path, repository: Path) -> None:
+    pytest.importorskip("resource")
+    environment = os.environ | {"PYTHONPATH": str(repository)}
+    child = subprocess.run(
+        [sys.executable, "-c", FULL_DISK], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert child.returncode == 0, child.stderr
