@@ -2,6 +2,7 @@
 
 import copy
 import math
+from typing import Literal
 
 import torch
 from torch import nn
@@ -76,7 +77,8 @@ def test_penalty_up_on_real_ignores_q_at_imagined_actions():
     raised = q.clone()
     raised[:, B // 2 :] = 100.0  # imagined rows
     real = (torch.arange(B) < B // 2).float()
-    for where, changes in (("real", False), ("mixture", True)):
+    cases: list[tuple[Literal["real", "mixture"], bool]] = [("real", False), ("mixture", True)]
+    for where, changes in cases:
         agent = make_agent(ImaginationOptions(penalty_up_on=where, buffer_size=10))
         before, after = (agent.conservative_gap(x, proposed, density, real) for x in (q, raised))
         assert torch.equal(before, after) is not changes

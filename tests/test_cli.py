@@ -1,10 +1,12 @@
 """`envtf`: help, exit codes, one readable sentence, and the stages and Lightning's command lines behind it."""
 
 import json
+import os
 import re
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -142,35 +144,47 @@ def test_lightnings_help_says_that_a_config_is_trusted(kind: str, capsys: pytest
     assert "trusted like code" in " ".join(capsys.readouterr().out.split())
 
 
-def test_model_fit_takes_dimensions_from_the_data_and_resumes(tiny_download: Path) -> None:
-    fit = ["fit", "--data.path", "data/dataset.h5", "--trainer.logger=false", "--trainer.enable_progress_bar=false"]
-    sizes = {"model.layers": 1, "model.width": 16, "model.context": 4, "updates_per_epoch": 2, "updates": 4}
-    options = [f"--model.options.{key}={value}" for key, value in sizes.items()]
-    run(tiny_download, "model", *fit, *options)
-    (checkpoint,) = (tiny_download / ".envtf").rglob("*step=4.ckpt")
-    resumed = run(tiny_download, "model", *fit, *options, "--trainer.max_epochs=3", "--ckpt_path", str(checkpoint))
-    assert "Restored all states" in resumed
-    assert list((tiny_download / ".envtf").rglob("*step=6.ckpt"))
-
-
-def test_agent_fit_trains_on_a_log(tiny_download: Path) -> None:
-    sizes = {"updates": 4, "updates_per_epoch": 4, "updates_per_step": 2, "warm_start": 2, "hidden": [8]}
-    options = [f"--model.options.{key}={value}" for key, value in sizes.items()]
-    output = run(tiny_download, "agent", "fit", "--data.path", "data/dataset.h5", "--trainer.logger=false", *options)
-    assert "max_epochs=1` reached" in output
-
-
 def test_lightnings_command_lines_refuse_bad_input_alike(project: Path) -> None:
     output = run(project, "model", "fit", "--data.path", "nowhere.h5", expected=2)
     assert "envtf: nowhere.h5" in output.splitlines()[-1]
     assert "Traceback" not in output
 
 
-def run(folder: Path, *arguments: str, expected: int = 0) -> str:
+FULL_DISK = """
+import resource, sys
+from envtf_lit.lightning_cli import run
+from envtf_lit.cli import main
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (4_000, 4_000))  # every larger file fails as on a full disk
+main(sys.argv[1:])
+"""
+
+
+def test_a_disk_that_is_full_of_checkpoints_is_said_in_a_sentence(tiny_download: Path, tmp_path: Path) -> None:
+    pytest.importorskip("resource")
+    sizes = {"model.layers": 1, "model.width": 16, "model.context": 4, "updates_per_epoch": 2, "updates": 2}
+    options = [f"--model.options.{key}={value}" for key, value in sizes.items()]
+    fit = ["model", "fit", "--data.path", str(tiny_download / "data/dataset.h5"), "--trainer.logger=false", *options]
+    output = run(tmp_path, *fit, program=["-c", FULL_DISK], expected=2)
+    assert output.splitlines()[-1].startswith("envtf: No space left on the disk")
+    assert not list(tmp_path.rglob("*.ckpt")) and not list(tmp_path.rglob("published"))
+
+
+def test_a_rendering_back_end_that_is_not_there_stops_neither_stage_nor_doctor(project: Path) -> None:
+    run(project, "download", "--quiet", "--download.transitions=1000", MUJOCO_GL="osmesa")
+    assert (project / "data/dataset.h5").exists()
+    report = run(project, "doctor", MUJOCO_GL="glut")  # none of MuJoCo's: nowhere installed
+    assert "MUJOCO_GL        glut" in report and "rendering " in report
+
+
+def run(
+    folder: Path, *arguments: str, expected: int = 0, program: Sequence[str] = ("-m", "envtf_lit"), **variables: str
+) -> str:
     """Runs `envtf` in a process of its own and returns all that it printed."""
     result = subprocess.run(
-        [sys.executable, "-m", "envtf_lit", *arguments],
+        [sys.executable, *program, *arguments],
         cwd=folder,
+        env=os.environ | variables,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

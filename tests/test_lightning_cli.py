@@ -1,7 +1,6 @@
 """`envtf model …` and `envtf agent …`: what comes from the data, from folders, from checkpoints, and where it goes."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -32,7 +31,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::jsonargparse._deprecated.Jsonar
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A project whose dataset has actions in [-2, 2]."""
     limit = np.full(3, 2.0, np.float32)
     save_dataset(replace(walker_dataset(), action_low=-limit, action_high=limit), tmp_path / "data/dataset.h5")
