@@ -1,8 +1,10 @@
 """`envtf model …` and `envtf agent …`: LightningCLI over the classes that the pipeline trains."""
 
 import json
+import re
 import warnings
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,8 @@ TRUST = (
     "--model.options.updates N, or --trainer.max_epochs N to leave the learning-rate schedule as it is. After fit, the "
     "weights of the last update lie in the folder `published`, whose path is printed."
 )
+
+LIGHTNINGS_OWN = re.compile(r"(best|last|hpc|registry.*|\w+://.*)$")  # checkpoints that are not local paths
 
 
 def world_model(
@@ -105,6 +109,7 @@ class _LinkedCLI(LightningCLI):
 
     from_data: tuple[str, ...] = ("observation_dim", "action_dim")
     links: dict[str, str]
+    options: type[TrainModelOptions] | type[PolicyOptions]
     verbs: tuple[str, ...]
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -118,7 +123,11 @@ class _LinkedCLI(LightningCLI):
         """Links that take a computation."""
 
     def subcommands(self) -> dict[str, set[str]]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return {verb: skipped for verb, skipped in LightningCLI.subcommands().items() if verb in self.verbs}
+        verbs = LightningCLI.subcommands()
+        return {verb: verbs[verb] | {"weights_only"} for verb in self.verbs}
+
+    def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
+        return {**super()._prepare_subcommand_kwargs(subcommand), "weights_only": True}  # checkpoints are data
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         with warnings.catch_warnings():  # these are this command's arguments, whatever stands in sys.argv
@@ -126,8 +135,8 @@ class _LinkedCLI(LightningCLI):
             super().parse_arguments(parser, args)
             verb = self.config.subcommand
             checkpoint = self.config[verb].ckpt_path
-            if checkpoint is not None:  # below any --config and flag: parsed as the first --config
-                begin, saved = args.index(verb) + 1, {"model": _saved_options(checkpoint)}
+            if checkpoint is not None and not LIGHTNINGS_OWN.match(checkpoint):  # below flags: the first --config
+                begin, saved = args.index(verb) + 1, {"model": _saved_options(checkpoint, self.options)}
                 super().parse_arguments(parser, [*args[:begin], "--config", json.dumps(saved), *args[begin:]])
 
     def _parse_ckpt_path(self) -> None:
@@ -135,7 +144,6 @@ class _LinkedCLI(LightningCLI):
 
     def before_instantiate_classes(self) -> None:
         config = self.config[str(self.subcommand)]
-        config.weights_only = True  # checkpoints are data
         options, trainer = config.model.options, config.trainer
         if trainer.max_epochs is None and trainer.max_steps == -1:
             trainer.max_epochs = max(1, options.updates // options.updates_per_epoch)
@@ -146,6 +154,7 @@ class _LinkedCLI(LightningCLI):
 class ModelCLI(_LinkedCLI):
     """`envtf model`."""
 
+    options = TrainModelOptions
     verbs = ("fit", "validate", "test")
     links = {
         "model.options.model.context": "data.context",
@@ -159,6 +168,7 @@ class ModelCLI(_LinkedCLI):
 class AgentCLI(_LinkedCLI):
     """`envtf agent`."""
 
+    options = PolicyOptions
     verbs = ("fit", "validate")
     from_data = ("observation_dim", "action_dim", "action_low", "action_high")
     links = {
@@ -174,14 +184,16 @@ class AgentCLI(_LinkedCLI):
         parser.link_arguments(updates, "data.steps_per_epoch", compute_fn=lambda epoch, step: max(1, epoch // step))
 
 
-def _saved_options(checkpoint: str) -> dict[str, Any]:
-    """The options and the seed that a Lightning checkpoint was trained with.
+def _saved_options(checkpoint: str, kind: type[TrainModelOptions] | type[PolicyOptions]) -> dict[str, Any]:
+    """The options, of this kind, and the seed that a Lightning checkpoint was trained with.
 
     Raises:
         UserError: the file is missing or is not such a checkpoint.
     """
     try:
         saved = torch.load(checkpoint, map_location="cpu", weights_only=True)["hyper_parameters"]
+        if not saved["options"].keys() <= {field.name for field in fields(kind)}:
+            raise KeyError
         return {name: saved[name] for name in ("options", "seed")}
     except FileNotFoundError:
         raise UserError(f"{checkpoint} does not exist: give --ckpt_path a checkpoint of an earlier fit.") from None

@@ -198,6 +198,7 @@ def test_checkpoints_that_do_not_fit_are_refused(folder: Path, capsys: pytest.Ca
     assert "not a checkpoint" in refused(capsys, "model", "fit", "--ckpt_path=data/dataset.h5")
     changed = refused(capsys, "model", "fit", NO_LOGGER, f"--ckpt_path={checkpoint}", **{"model.width": 8})
     assert "does not fit the model" in changed and "change the architecture" in changed
+    assert "not a checkpoint" in refused(capsys, "agent", "fit", NO_LOGGER, f"--ckpt_path={checkpoint}")
 
 
 def test_a_saved_config_is_a_config(folder: Path) -> None:
