@@ -176,6 +176,7 @@ class AgentCLI(_LinkedCLI):
         "model.options.updates_per_step": "data.updates_per_step",
         "model.options.discount": "data.discount",
         "model.options.n_step": "data.n_step",
+        "model.options.return_temperature": "data.return_temperature",
         "model.seed": "data.seed",
     }
 

@@ -149,6 +149,10 @@ class PolicyOptions:
         critics: Q-functions, of which the target takes the smallest.
         layer_norm: LayerNorm in the critics.
         discount: of future rewards, per step.
+        normalise_returns: divides rewards by the standard deviation of the log's Monte-Carlo returns, so that Q has
+            unit spread on any robot and the other weights mean the same everywhere.
+        return_temperature: real rows are drawn with chances exp(episode return / temperature), returns scaled to
+            [0, 1], so that a mostly poor log teaches what its best episodes did; null draws uniformly.
         n_step: real steps whose rewards enter the temporal-difference target.
         target_rate: share of the critics that enters the target networks at each update.
         actor_learning_rate: Adam's.
@@ -156,6 +160,7 @@ class PolicyOptions:
         critic_learning_rate: Adam's.
         cql_weight: weight of the conservative term.
         initial_alpha: weight of the entropy in the actor's objective at the start; learned from there on.
+        clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log.
         sampled_actions: actions of each kind (uniform, pi(s), pi(s')) in the log-sum-exp.
         temperature: of the log-sum-exp.
         warm_start: first updates, in which the critics fit Monte-Carlo returns and the actor clones the data.
@@ -172,6 +177,8 @@ class PolicyOptions:
     critics: int = 2
     layer_norm: bool = True
     discount: float = 0.99
+    normalise_returns: bool = True
+    return_temperature: float | None = 0.1
     n_step: int = 1
     target_rate: float = 0.005
     actor_learning_rate: float = 0.0001
@@ -179,6 +186,7 @@ class PolicyOptions:
     critic_learning_rate: float = 0.0003
     cql_weight: float = 5.0
     initial_alpha: float = 0.1
+    clone_weight: float = 0.05
     sampled_actions: int = 4
     temperature: float = 1.0
     warm_start: int = 2_000

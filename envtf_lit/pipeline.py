@@ -148,6 +148,7 @@ def train_policy(
             steps_per_epoch=options.updates_per_epoch // options.updates_per_step,
             discount=options.discount,
             n_step=options.n_step,
+            return_temperature=options.return_temperature,
             seed=params.seed,
         )
         agent = CQL(

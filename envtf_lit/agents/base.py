@@ -40,6 +40,7 @@ class OfflineAgent(L.LightningModule, ABC):
     """
 
     log_alpha: nn.Parameter
+    return_scale: Tensor
 
     def __init__(
         self,
@@ -82,7 +83,9 @@ class OfflineAgent(L.LightningModule, ABC):
         if self.options.imagination is not None:
             self.ring = ImaginedRing(observation_dim, action_dim, self.options.imagination.buffer_size)
         self.imagination: Imagination | None = None
+        self.first: Rollouts | None = None
         self.reward_std = 1.0
+        self.register_buffer("return_scale", torch.ones(()))  # rewards are divided by it: see `normalise_returns`
 
     def normalise_with(self, mean: Tensor, std: Tensor) -> None:
         """Sets the observation scale of every network."""
@@ -92,19 +95,23 @@ class OfflineAgent(L.LightningModule, ABC):
 
     def dream_with(self, imagination: Imagination, first: Rollouts, *, reward_std: float) -> None:
         """Gives the agent a world model, stored rollouts to begin with, and the unit of the penalty."""
-        self.imagination, self.reward_std = imagination, reward_std
-        self.remember(first)
+        self.imagination, self.reward_std, self.first = imagination, reward_std, first
 
     # Lightning hooks
 
     def setup(self, stage: str) -> None:
-        """Takes the observation scale from the dataset, or the actor's, with its weights, from `init_from`."""
+        """Takes the scales from the dataset (the actor's, with its weights, from `init_from`) and the first rollouts."""
         data: TransitionData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
         self.normalise_with(*observation_scale(torch.as_tensor(data.dataset.observations)))
         if self.init_from is not None:
             for actor in (self.actor, self.average_actor):
                 load_weights(actor, f"{self.init_from}/weights.safetensors")
-        self.return_variance = data.transitions.columns["returns"].var(correction=0).clamp(min=1e-12).item()
+        returns = data.transitions.columns["returns"]
+        self.return_variance = returns.var(correction=0).clamp(min=1e-12).item()
+        if self.options.normalise_returns:
+            self.return_scale.fill_(self.return_variance**0.5)
+        if self.first is not None:
+            self.remember(self.first)
 
     def on_train_epoch_start(self) -> None:
         self.generator = epoch_generator(self.seed, self.current_epoch, "agent")
@@ -124,7 +131,7 @@ class OfflineAgent(L.LightningModule, ABC):
             self.log("val/imagined_return", self.imagination.imagined_return(self.average_actor))
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
-        q = self.critics(batch["observations"], batch["actions"]).min(0).values
+        q = self.return_scale * self.critics(batch["observations"], batch["actions"]).min(0).values
         action = self.average_actor.act(batch["observations"])
         logs = dict(
             q_data=q.mean(),
@@ -144,6 +151,7 @@ class OfflineAgent(L.LightningModule, ABC):
 
     def update(self, batch: Batch) -> dict[str, Tensor]:
         """One gradient step of every part; returns detached scalars to log."""
+        batch = batch | {name: batch[name] / self.return_scale for name in ("rewards", "returns")}
         if self.update_index < self.options.warm_start:
             return self.warm_up(batch)
         batch = self.mix(batch)
@@ -164,13 +172,18 @@ class OfflineAgent(L.LightningModule, ABC):
         q = self.critics(batch["observations"], batch["actions"])
         critic_loss = 0.5 * (q - batch["returns"]).square().mean(1).sum()
         _descend(self, critic_optimizer, critic_loss)
-        clone_loss = -self.actor.log_prob(batch["observations"], batch["actions"]).mean()
+        clone_loss = self.clone_loss(batch | {"real": torch.ones_like(batch["rewards"])})
         if self.init_from is None:
             _descend(self, actor_optimizer, clone_loss)
         if self.update_index == self.options.warm_start - 1:
             self.target_critics.load_state_dict(self.critics.state_dict())
             self.average_actor.load_state_dict(self.actor.state_dict())
         return dict(warm_critic_loss=critic_loss, clone_loss=clone_loss, q_data=q.mean())
+
+    def clone_loss(self, batch: Batch) -> Tensor:
+        """`-log pi(a|s)`, mean over the real rows."""
+        log_density = self.actor.log_prob(batch["observations"], batch["actions"])
+        return -(batch["real"] * log_density).sum() / batch["real"].sum()
 
     def _optimizers(self) -> list[Any]:
         """The three optimisers, at the learning rates of the current update."""
@@ -209,6 +222,7 @@ class OfflineAgent(L.LightningModule, ABC):
         imagination = self.options.imagination
         assert self.ring is not None and imagination is not None
         rewards = rollouts.rewards - imagination.penalty * self.reward_std * rollouts.uncertainty
+        rewards = rewards / self.return_scale
         if imagination.multi_step:
             total, end, weight = rollouts.returns(rewards, self.options.discount)
         else:

@@ -59,11 +59,15 @@ class CQL(OfflineAgent):
         return (pushed_down - q_data).mean(1)
 
     def actor_loss(self, batch: Batch, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-        """`E[alpha log pi(a|s) - min_i Q_i(s, a)], a ~ pi(s)`, alpha held fixed."""
+        """`E[alpha log pi(a|s) - min_i Q_i(s, a)], a ~ pi(s)`, alpha held fixed, and `clone_weight * clone_loss`."""
         action, log_density = self.actor.sample(batch["observations"], generator=generator)
         q = self.critics(batch["observations"], action).min(0).values
         loss = (self.log_alpha.detach().exp() * log_density - q).mean()
-        return loss, dict(q_policy=q.mean(), entropy=-log_density.mean())
+        logs = dict(q_policy=q.mean(), entropy=-log_density.mean())
+        if self.options.clone_weight > 0:
+            logs["clone_loss"] = self.clone_loss(batch)
+            loss = loss + self.options.clone_weight * logs["clone_loss"]
+        return loss, logs
 
     def temperature_loss(self, entropy: Tensor) -> Tensor:
         """`alpha (H - H_target)`, H_target = -A (Haarnoja et al. 2018, equation 18)."""

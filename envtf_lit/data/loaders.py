@@ -24,10 +24,21 @@ def epoch_generator(seed: int, epoch: int, stream: str) -> torch.Generator:
 
 
 class DrawSampler(Sampler[Tensor]):
-    """Yields `batches` tensors of uniform draws from [0, rows), of shape `shape`, anew in each epoch."""
+    """Yields `batches` tensors of draws from [0, rows), of shape `shape`, anew in each epoch.
 
-    def __init__(self, rows: int, shape: tuple[int, ...], batches: int, *, seed: int) -> None:
+    Args:
+        rows: number of rows.
+        shape: of each draw.
+        batches: draws per epoch.
+        seed: with the epoch, names the random stream.
+        weights: (rows,) chances of each row, up to a factor; None draws uniformly.
+    """
+
+    def __init__(
+        self, rows: int, shape: tuple[int, ...], batches: int, *, seed: int, weights: Tensor | None = None
+    ) -> None:
         self.rows, self.shape, self.batches, self.seed, self.epoch = rows, shape, batches, seed, 0
+        self.cumulative = None if weights is None else weights.double().cumsum(0) / weights.double().sum()
 
     def set_epoch(self, epoch: int) -> None:
         """Called by Lightning before each epoch."""
@@ -39,7 +50,21 @@ class DrawSampler(Sampler[Tensor]):
     def __iter__(self) -> Iterator[Tensor]:
         generator = epoch_generator(self.seed, self.epoch, "rows")
         for _ in range(self.batches):
-            yield torch.randint(self.rows, self.shape, generator=generator)
+            if self.cumulative is None:
+                yield torch.randint(self.rows, self.shape, generator=generator)
+            else:
+                uniform = torch.rand(self.shape, generator=generator, dtype=torch.float64)
+                yield torch.searchsorted(self.cumulative, uniform).clamp(max=self.rows - 1)
+
+
+def return_weights(dataset: OfflineDataset, temperature: float) -> Tensor:
+    """(N,) `exp(R / temperature)`, R the row's episode return scaled to [0, 1] (Hong et al. 2023, trajectory weighting).
+
+    A log that is mostly poor then teaches what its best episodes did; a small temperature means a sharp preference.
+    """
+    returns = dataset.episode_returns
+    scaled = (returns - returns.min()) / max(returns.max() - returns.min(), 1e-9)
+    return torch.as_tensor(np.exp((scaled - 1.0) / temperature)[dataset.episode_index])
 
 
 class Windows(Dataset[dict[str, Tensor]]):
@@ -179,6 +204,7 @@ class TransitionData(L.LightningDataModule):
         steps_per_epoch: Lightning training steps per epoch.
         discount: of future rewards, per step.
         n_step: steps whose rewards enter the temporal-difference target.
+        return_temperature: of `return_weights`; None draws rows uniformly.
         seed: of all draws.
     """
 
@@ -190,11 +216,13 @@ class TransitionData(L.LightningDataModule):
         steps_per_epoch: int = 50,
         discount: float = 0.99,
         n_step: int = 1,
+        return_temperature: float | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
         self.batch_size, self.updates_per_step, self.steps_per_epoch = batch_size, updates_per_step, steps_per_epoch
         self.discount, self.n_step, self.seed = discount, n_step, seed
+        self.return_temperature = return_temperature
         self.dataset = load_dataset(path)
         self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
         self.action_low, self.action_high = self.dataset.action_low.tolist(), self.dataset.action_high.tolist()
@@ -207,7 +235,9 @@ class TransitionData(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
         """Batches (updates_per_step, batch_size, …) of `Transitions`."""
         shape = (self.updates_per_step, self.batch_size)
-        sampler = DrawSampler(len(self.transitions), shape, self.steps_per_epoch, seed=self.seed)
+        temperature = self.return_temperature
+        weights = None if temperature is None else return_weights(self.dataset, temperature)
+        sampler = DrawSampler(len(self.transitions), shape, self.steps_per_epoch, seed=self.seed, weights=weights)
         return _loader(self.transitions, sampler)
 
     def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:
