@@ -113,6 +113,7 @@ def imagine(
     *,
     horizon: int,
     terminated: Callable[[Tensor], Tensor],
+    tail: int = 0,
     mode: Mode = "sample",
     generator: torch.Generator | None = None,
     batch_size: int = 4_096,
@@ -125,6 +126,7 @@ def imagine(
         model: any world model; `starts` are the arguments of its `init`.
         policy: acts on (B, S).
         terminated: the robot's rule, next observations (B, S) to bool (B,).
+        tail: further steps, with the policy's deterministic actions and mean predictions.
         mode: of `WorldModel.step`.
         generator: of the actions and of sampled next states.
         batch_size: rollouts imagined at a time.
@@ -134,8 +136,9 @@ def imagine(
         chunk = tuple(part[begin : begin + batch_size] for part in starts)
         state = model.init(*chunk)
         branch = torch.arange(begin, begin + len(chunk[0]), device=chunk[0].device)
-        for step in range(horizon):
-            part, state = _advance(model, policy, state, branch, step, terminated, mode, generator)
+        for step in range(horizon + tail):
+            actor, how = (policy, mode) if step < horizon else (_Deterministic(policy), "mean")
+            part, state = _advance(model, actor, state, branch, step, terminated, how, generator)
             parts.append(part)
             alive = (~part.terminated).nonzero()[:, 0]
             if len(alive) == 0:
@@ -177,6 +180,7 @@ class Imagination:
             policy,
             starts,
             horizon=o.horizon,
+            tail=o.tail,
             terminated=self.terminated,
             mode=o.mode,
             generator=generator,

@@ -40,7 +40,7 @@ class ModelOptions:
     layers: int = 4
     heads: int = 4
     width: int = 128
-    context: int = 32
+    context: int = 16
     dropout: float = 0.0
     activation: Literal["relu", "gelu"] = "gelu"
     objective: Literal["beta_nll", "nll", "paper_mse"] = "beta_nll"
@@ -110,6 +110,8 @@ class ImaginationOptions:
             (the paper's fixed buffer).
         branches: rollouts per round.
         horizon: steps of each rollout, unless the robot falls first.
+        tail: deterministic steps after the horizon, which are not learned from but whose rewards, and end, enter the
+            targets of the steps before them (model-based value expansion, Feinberg et al. 2018).
         history: real steps given to the model before the branch point.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
         buffer_size: imagined transitions kept; the oldest leave first.
@@ -126,6 +128,7 @@ class ImaginationOptions:
     refresh_every: int = 250
     branches: int = 2_000
     horizon: int = 5
+    tail: int = 0
     history: int = 4
     mode: Literal["mean", "sample"] = "sample"
     buffer_size: int = 100_000
@@ -169,7 +172,7 @@ class PolicyOptions:
         imagination: None trains on data alone.
     """
 
-    updates: int = 10_000
+    updates: int = 4_500
     updates_per_epoch: int = 500
     updates_per_step: int = 10
     batch_size: int = 256
@@ -179,19 +182,19 @@ class PolicyOptions:
     discount: float = 0.99
     normalise_returns: bool = True
     return_temperature: float | None = 0.1
-    n_step: int = 1
+    n_step: int = 20
     target_rate: float = 0.005
-    actor_learning_rate: float = 0.0001
+    actor_learning_rate: float = 0.0003
     actor_schedule: Literal["constant", "cosine"] = "cosine"
     critic_learning_rate: float = 0.0003
-    cql_weight: float = 5.0
-    initial_alpha: float = 0.1
-    clone_weight: float = 0.05
-    sampled_actions: int = 4
+    cql_weight: float = 0.1
+    initial_alpha: float = 0.01
+    clone_weight: float = 0.25
+    sampled_actions: int = 2
     temperature: float = 1.0
-    warm_start: int = 2_000
+    warm_start: int = 1_500
     warm_start_learning_rate: float = 0.001
-    actor_average: float = 0.005
+    actor_average: float = 0.002
     imagination: ImaginationOptions | None = None
 
 

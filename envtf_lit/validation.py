@@ -32,7 +32,9 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("updates_per_step", "batch_size", "clone_updates", "clone_batch_size", "branches"), _COUNT),
     **dict.fromkeys(("horizon", "buffer_size", "hidden", "critics", "sampled_actions", "episodes"), _COUNT),
     **dict.fromkeys(("trajectories", "n_step", "selection_steps"), _COUNT),
-    **dict.fromkeys(("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty"), _NOT_NEGATIVE),
+    **dict.fromkeys(
+        ("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty", "tail"), _NOT_NEGATIVE
+    ),
     **dict.fromkeys(("cql_weight", "clone_weight", "warm_start", "selection_episodes"), _NOT_NEGATIVE),
     **dict.fromkeys(("learning_rate", "actor_learning_rate", "critic_learning_rate"), _POSITIVE),
     **dict.fromkeys(

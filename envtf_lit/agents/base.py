@@ -100,7 +100,7 @@ class OfflineAgent(L.LightningModule, ABC):
     # Lightning hooks
 
     def setup(self, stage: str) -> None:
-        """Takes the scales from the dataset (the actor's, with its weights, from `init_from`) and the first rollouts."""
+        """Takes scales from the dataset (the actor's, with its weights, from `init_from`) and the first rollouts."""
         data: TransitionData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
         self.normalise_with(*observation_scale(torch.as_tensor(data.dataset.observations)))
         if self.init_from is not None:
@@ -228,15 +228,15 @@ class OfflineAgent(L.LightningModule, ABC):
         else:
             weight = self.options.discount * (~rollouts.terminated).float()
             total, end = rewards, rollouts.next_observations
-        self.ring.add(
-            dict(
-                observations=rollouts.observations,
-                actions=rollouts.actions,
-                rewards=total,
-                next_observations=end,
-                discounts=weight,
-            )
+        kept = rollouts.step < imagination.horizon  # what comes after is there for its rewards
+        columns = dict(
+            observations=rollouts.observations,
+            actions=rollouts.actions,
+            rewards=total,
+            next_observations=end,
+            discounts=weight,
         )
+        self.ring.add({name: column[kept] for name, column in columns.items()})
 
     def _refresh_now(self, imagination: ImaginationOptions) -> bool:
         every = imagination.refresh_every

@@ -58,7 +58,7 @@ class DrawSampler(Sampler[Tensor]):
 
 
 def return_weights(dataset: OfflineDataset, temperature: float) -> Tensor:
-    """(N,) `exp(R / temperature)`, R the row's episode return scaled to [0, 1] (Hong et al. 2023, trajectory weighting).
+    """(N,) `exp(R / temperature)`, R the row's episode return scaled to [0, 1] (Hong et al. 2023).
 
     A log that is mostly poor then teaches what its best episodes did; a small temperature means a sharp preference.
     """
