@@ -126,17 +126,17 @@ class ImaginationOptions:
 
     real_ratio: float = 0.5
     refresh_every: int = 250
-    branches: int = 2_000
-    horizon: int = 5
-    tail: int = 0
+    branches: int = 500
+    horizon: int = 2
+    tail: int = 50
     history: int = 4
     mode: Literal["mean", "sample"] = "sample"
-    buffer_size: int = 100_000
+    buffer_size: int = 10_000
     multi_step: bool = True
     penalty: float = 0.0
     penalty_up_on: Literal["real", "mixture"] = "real"
-    selection_episodes: int = 32
-    selection_steps: int = 500
+    selection_episodes: int = 0
+    selection_steps: int = 1_000
 
 
 @dataclass(frozen=True)

@@ -189,3 +189,21 @@ def test_mixing_keeps_the_real_ratio_and_charges_for_uncertainty():
     assert torch.equal(mixed["rewards"][:6], batch["rewards"][:6])
     assert mixed["rewards"][6:].tolist() == [1.0 - 2.0 * 3.0 * 0.5] * 2
     torch.testing.assert_close(mixed["discounts"][6:], torch.full((2,), 0.99))
+
+
+def test_steps_of_the_tail_enter_targets_but_not_the_ring():
+    agent = make_agent(ImaginationOptions(horizon=1, tail=1, buffer_size=20), discount=0.5)
+    rollouts = make_rollouts(4)
+    rollouts.branch[2:] = rollouts.branch[:2]
+    rollouts.step[2:] = 1  # two rollouts of two steps
+    agent.remember(rollouts)
+    assert agent.ring is not None and len(agent.ring) == 2
+    assert agent.ring.get_buffer("rewards")[:2].tolist() == [1.5, 1.5]
+    assert agent.ring.get_buffer("discounts")[:2].tolist() == [0.25, 0.25]
+
+
+def test_rewards_are_divided_by_the_return_scale():
+    agent = make_agent(ImaginationOptions(refresh_every=0, buffer_size=20))
+    agent.return_scale.fill_(4.0)
+    agent.remember(make_rollouts(2))
+    assert agent.ring is not None and agent.ring.get_buffer("rewards")[:2].tolist() == [0.25, 0.25]

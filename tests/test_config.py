@@ -133,7 +133,7 @@ REFUSED = {
     "train_policy: {cql: {imagination: {horizon: 1}}}": ["cql.imagination must be null"],
     "train_policy: {et_cql: {imagination: null}}": ["et_cql.imagination is null"],
     "train_policy: {et_cql: {imagination: {horizn: 1}}}": ["'horizn'", "did you mean 'horizon'?"],
-    "generate_rollouts: {history: 40}": ["generate_rollouts.history is 40", "at most 31"],
+    "generate_rollouts: {history: 40}": ["generate_rollouts.history is 40", "at most 15"],
     "download: {source: file}": ["download.path is null", "give the path"],
     "download: {path: x.h5}": ["download.path is 'x.h5'", "set download.source to 'file'"],
     "download: {transitions: 10}": ["download.transitions is 10", "1000 or more"],

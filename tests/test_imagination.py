@@ -61,6 +61,20 @@ def test_multi_step_returns_against_a_plain_loop():
         assert torch.equal(end[row], rollouts.next_observations[last])
 
 
+def test_tails_are_deterministic_and_only_their_rewards_are_remembered():
+    torch.manual_seed(0)
+    model, actor = EnvironmentTransformer(2, 1, layers=1, heads=1, width=8, context=8), TanhGaussianActor(2, 1)
+    starts = BranchPoints(make_dataset()).draw(10, 0, torch.Generator().manual_seed(0))
+    never = lambda observation: torch.zeros(len(observation), dtype=torch.bool)  # noqa: E731
+    generator = torch.Generator().manual_seed(0)
+    rollouts = imagine(model, actor, starts, horizon=2, tail=3, terminated=never, generator=generator)
+    assert torch.bincount(rollouts.step).tolist() == [10] * 5
+    for step in range(5):
+        rows = rollouts.step == step
+        own = actor.act(rollouts.observations[rows], deterministic=True)
+        assert torch.allclose(own, rollouts.actions[rows]) is (step >= 2)
+
+
 def test_noise_respects_the_action_range():
     actor = TanhGaussianActor(2, 1, action_low=[0.0], action_high=[4.0])
     action = NoisyPolicy(actor, 1.0).act(torch.randn(1000, 2), generator=torch.Generator().manual_seed(0))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import DrawSampler, Transitions, Windows, epoch_generator
+from envtf_lit.data.loaders import DrawSampler, Transitions, Windows, epoch_generator, return_weights
 
 
 def make_dataset(lengths=(3, 1, 5), terminated=(True, False, True)) -> OfflineDataset:
@@ -76,3 +76,12 @@ def test_streams_differ(other):
     draw = lambda *key: torch.rand(4, generator=epoch_generator(*key))  # noqa: E731
     assert torch.equal(draw(0, 0, "rows"), draw(0, 0, "rows"))
     assert not torch.equal(draw(0, 0, "rows"), draw(*other))
+
+
+def test_rows_of_better_episodes_are_drawn_more_often():
+    dataset = make_dataset()  # episode returns 3, 3 and 30
+    weights = return_weights(dataset, temperature=0.5)
+    assert float(weights[4] / weights[0]) == pytest.approx(np.exp(1.0 / 0.5))
+    draws = next(iter(DrawSampler(9, (90_000,), 1, seed=0, weights=weights)))
+    shares = torch.bincount(draws, minlength=9) / 90_000
+    torch.testing.assert_close(shares, (weights / weights.sum()).float(), atol=5e-3, rtol=0)
