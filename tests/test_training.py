@@ -1,7 +1,9 @@
 """Runs that resume to the same bits, start afresh when a parameter changes, and keep the best model."""
 
 import csv
-from dataclasses import replace
+import subprocess
+import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import lightning as L
@@ -10,11 +12,15 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from envtf_lit import pipeline
+from envtf_lit.config import params_yaml, preset_params
 from envtf_lit.data.formats import save_dataset
 from envtf_lit.params import ImaginationOptions, ModelOptions, Params, PolicyOptions, TrainModelOptions
 from envtf_lit.storage import load_weights
 from envtf_lit.training import run_folder
+from envtf_lit.world_models.horizon import Scale, open_loop_error, segments
+from envtf_lit.world_models.lit import SELECTION_HORIZON, SELECTION_SEGMENTS
 from envtf_lit.world_models.store import load_world_model
+from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.walker import walker_dataset
 
 TINY = Params(
@@ -142,6 +148,46 @@ def test_run_folders_differ_by_parameters_and_by_bytes(tmp_path):
     assert first != run_folder(tmp_path, "stage", {"seed": 1}, [data])
     data.write_bytes(b"two")
     assert first != run_folder(tmp_path, "stage", {"seed": 0}, [data])
+
+
+def test_the_training_metric_is_what_the_saved_model_scores(root):
+    metrics = pipeline.train_model(TINY, root, progress=False)
+    training, held_out = walker_dataset().split(TINY.train_model.held_out, seed=TINY.seed)
+    stretches = segments(held_out, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=TINY.seed)
+    error = open_loop_error(load_world_model(root / "models/world_model"), stretches, Scale.of(training))
+    assert error == pytest.approx(metrics["open_loop_error"], rel=1e-5)
+
+
+def test_two_processes_with_one_seed_write_the_same_bytes(tmp_path):
+    outputs = []
+    for name in ("one", "two"):
+        save_dataset(walker_dataset(), tmp_path / name / "data/dataset.h5")
+        (tmp_path / name / "params.yaml").write_text(params_yaml(TINY))
+        for stage in (["train_model"], ["generate_rollouts"], ["train_policy", "et_cql"]):
+            subprocess.run([sys.executable, "-m", "envtf_lit", *stage, "--quiet"], cwd=tmp_path / name, check=True)
+        written = [p for p in sorted((tmp_path / name).rglob("*")) if p.is_file() and ".envtf" not in p.parts]
+        outputs.append({str(p.relative_to(tmp_path / name)): p.read_bytes() for p in written})
+    assert len(outputs[0]) > 12 and outputs[0] == outputs[1]
+
+
+@pytest.mark.slow
+def test_the_papers_model_learns_a_step():
+    options = preset_params("paper").train_model
+    model = EnvironmentTransformer(27, 8, **asdict(options.model))
+    assert 95e6 < sum(p.numel() for p in model.parameters()) < 105e6
+    B, T = options.batch_size, options.model.context
+    batch = dict(
+        observations=torch.randn(B, T, 27),
+        actions=torch.randn(B, T, 8),
+        next_observations=torch.randn(B, T, 27),
+        rewards=torch.randn(B, T),
+        mask=torch.ones(B, T),
+    )
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss = model.loss(batch)
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in model.parameters())
 
 
 def test_saved_models_come_back_whole(root):

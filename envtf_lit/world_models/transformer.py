@@ -58,17 +58,21 @@ class Attention(nn.Module):
         return self.out(y.transpose(1, 2).reshape(B, T, H * d))  # (B, T, D)
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
-        """Whole sequences; `mask` None means plain causal attention."""
+        """Whole sequences (B, H, T, d); `mask` None means plain causal attention."""
+        if q.device.type == "cpu":  # torch's fused kernel there has a bf16 backward pass five to eight times slower
+            T = q.shape[2]
+            return self.attend(q, k, v, window_mask(T, T, q.device) if mask is None else mask)
         dropout = self.dropout if self.training else 0.0
         y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=mask is None, dropout_p=dropout)
         return self.merge(y)
 
     def attend(self, q: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
-        """One query (B, H, 1, d) over cached keys and values (B, H, C, d), as two batched products."""
-        score = q @ keys.transpose(-2, -1) * q.shape[-1] ** -0.5  # (B, H, 1, C)
+        """Queries (B, H, T, d) over keys and values (B, H, C, d), as two batched products; what `mask` lacks is hid."""
+        score = q @ keys.transpose(-2, -1) * q.shape[-1] ** -0.5  # (B, H, T, C)
         if mask is not None:
-            score = score.masked_fill(~mask[:, None, None, :], float("-inf"))
-        return self.merge(score.float().softmax(-1).to(values.dtype) @ values)
+            score = score.masked_fill(~mask, float("-inf"))
+        weight = F.dropout(score.float().softmax(-1), self.dropout, self.training)
+        return self.merge(weight.to(values.dtype) @ values)
 
 
 class Block(nn.Module):
@@ -242,12 +246,12 @@ class EnvironmentTransformer(nn.Module):
         return TransformerState(cache, state.clock + 1, state.first, prediction.observation), prediction
 
     def _visible(self, state: TransformerState, filled: int) -> Tensor | None:
-        """(B, filled) slots that hold a token of the row itself, or None where all do."""
+        """(B, 1, 1, filled) slots that hold a token of the row itself, or None where all do."""
         if state.first is None:
             return None
         slots = torch.arange(filled, device=state.first.device)
         positions = state.clock - (state.clock - slots) % self.options.context
-        return positions >= state.first[:, None]
+        return (positions >= state.first[:, None])[:, None, None]
 
     def predict(
         self, hidden: Tensor, observation: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None
