@@ -124,14 +124,14 @@ class ImaginationOptions:
         selection_steps: of each such episode at most.
     """
 
-    real_ratio: float = 0.5
+    real_ratio: float = 0.75
     refresh_every: int = 250
-    branches: int = 500
-    horizon: int = 2
+    branches: int = 1_500
+    horizon: int = 1
     tail: int = 50
     history: int = 4
     mode: Literal["mean", "sample"] = "sample"
-    buffer_size: int = 10_000
+    buffer_size: int = 20_000
     multi_step: bool = True
     penalty: float = 0.0
     penalty_up_on: Literal["real", "mixture"] = "real"
