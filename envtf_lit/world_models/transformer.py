@@ -68,11 +68,13 @@ class Attention(nn.Module):
 
     def attend(self, q: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
         """Queries (B, H, T, d) over keys and values (B, H, C, d), as two batched products; what `mask` lacks is hid."""
-        score = q @ keys.transpose(-2, -1) * q.shape[-1] ** -0.5  # (B, H, T, C)
-        if mask is not None:
-            score = score.masked_fill(~mask, float("-inf"))
-        weight = F.dropout(score.float().softmax(-1), self.dropout, self.training)
-        return self.merge(weight.to(values.dtype) @ values)
+        with torch.autocast(q.device.type, enabled=False):  # or a fp32 cache would be cast, whole, at every step
+            score = q @ keys.transpose(-2, -1) * q.shape[-1] ** -0.5  # (B, H, T, C)
+            if mask is not None:
+                score = score.masked_fill(~mask, float("-inf"))
+            weight = F.dropout(score.float().softmax(-1), self.dropout, self.training)
+            y = weight.to(values.dtype) @ values
+        return self.merge(y)
 
 
 class Block(nn.Module):
