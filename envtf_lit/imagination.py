@@ -73,17 +73,29 @@ class Rollouts:
 
 
 class BranchPoints:
-    """Real states to branch from, with the real steps that led to them."""
+    """Real states to branch from, with the real steps that led to them.
 
-    def __init__(self, dataset: OfflineDataset, device: torch.device | str = "cpu") -> None:
+    Args:
+        dataset: where they come from.
+        device: where they go.
+        weights: (N,) chances of each row, up to a factor; None draws uniformly.
+    """
+
+    def __init__(
+        self, dataset: OfflineDataset, device: torch.device | str = "cpu", weights: Tensor | None = None
+    ) -> None:
+        if weights is None:
+            weights = torch.ones(len(dataset))
+        self.cumulative = (weights.double().cumsum(0) / weights.double().sum()).to(device)
         self.observations = torch.as_tensor(dataset.observations, device=device)
         self.actions = torch.as_tensor(dataset.actions, device=device)
         self.starts = torch.as_tensor(dataset.episode_starts[dataset.episode_index], device=device)
 
     def draw(self, count: int, history: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Uniform rows, each with up to `history` steps before it: the arguments of `WorldModel.init`."""
+        """Rows, each with up to `history` steps before it: the arguments of `WorldModel.init`."""
         device = self.starts.device
-        row = torch.randint(len(self.starts), (count,), generator=generator, device=device)
+        uniform = torch.rand(count, generator=generator, device=device, dtype=torch.float64)
+        row = torch.searchsorted(self.cumulative, uniform).clamp(max=len(self.starts) - 1)
         start = torch.maximum(row - history, self.starts[row])
         index = torch.minimum(
             start[:, None] + torch.arange(history + 1, device=device), row[:, None]
@@ -156,6 +168,7 @@ class Imagination:
         dataset: gives the states to branch from and the first states of episodes.
         terminated: the robot's rule.
         options: of the rollouts and of the judgement.
+        weights: (N,) chances of each row to be branched from; None draws uniformly.
     """
 
     def __init__(
@@ -165,9 +178,10 @@ class Imagination:
         terminated: Callable[[Tensor], Tensor],
         options: ImaginationOptions,
         device: torch.device | str = "cpu",
+        weights: Tensor | None = None,
     ) -> None:
         self.model, self.terminated, self.options = model, terminated, options
-        self.starts = BranchPoints(dataset, device)
+        self.starts = BranchPoints(dataset, device, weights)
         chosen = np.linspace(0, len(dataset.episode_starts) - 1, max(1, options.selection_episodes)).astype(int)
         self.first = torch.as_tensor(dataset.observations[dataset.episode_starts[chosen]], device=device)
 

@@ -262,12 +262,15 @@ def report(params: Params, root: Path = Path("."), *, progress: bool = True) -> 
 
 def _give_imagination(agent: Any, params: Params, root: Path, dataset: Any) -> None:
     """Hands an agent the world model and the stored rollouts."""
+    from envtf_lit.data.loaders import return_weights
     from envtf_lit.imagination import Imagination, load_rollouts
     from envtf_lit.world_models.store import load_world_model
 
     device = pick_device()
     model = load_world_model(root / WORLD_MODEL).to(device)
-    imagination = Imagination(model, dataset, _robot(params).terminated, agent.options.imagination, device)
+    temperature = agent.options.return_temperature
+    weights = None if temperature is None else return_weights(dataset, temperature)  # as the real rows are drawn
+    imagination = Imagination(model, dataset, _robot(params).terminated, agent.options.imagination, device, weights)
     agent.dream_with(imagination, load_rollouts(root / ROLLOUTS), reward_std=float(dataset.rewards.std()))
 
 

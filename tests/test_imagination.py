@@ -32,6 +32,14 @@ def test_histories_are_real_steps_of_the_same_episode():
         assert lengths[row] == min(3, int(rows[-1]) - start + 1)
 
 
+def test_rows_are_branched_from_as_often_as_they_weigh():
+    weights = torch.tensor([0.0, 1.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 0.0])
+    starts = BranchPoints(make_dataset(), weights=weights)
+    observations, _, _ = starts.draw(40_000, 0, torch.Generator().manual_seed(0))
+    shares = torch.bincount(observations[:, 0, 0].long(), minlength=9) / 40_000
+    torch.testing.assert_close(shares, weights / 4, atol=0.01, rtol=0)
+
+
 def test_rollouts_are_chained_and_stop_where_the_robot_falls():
     rollouts = make_rollouts()
     assert 0 < rollouts.terminated.sum() < 50
