@@ -131,7 +131,7 @@ class ImaginationOptions:
     tail: int = 50
     history: int = 4
     mode: Literal["mean", "sample"] = "sample"
-    buffer_size: int = 20_000
+    buffer_size: int = 4_500
     multi_step: bool = True
     penalty: float = 0.0
     penalty_up_on: Literal["real", "mixture"] = "real"
