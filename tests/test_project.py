@@ -65,6 +65,7 @@ def test_every_tracked_option_is_in_params_yaml() -> None:
         for key in stage.get("params", []):
             tree = read_yaml("params.yaml")
             for name in key.split("."):
+                assert name in tree, key
                 tree = tree[name]
 
 
