@@ -87,8 +87,24 @@ def build_parser() -> argparse.ArgumentParser:
     params = _add(commands, "params", "Print a complete params.yaml", _params)
     for command in (init, params):
         command.add_argument("--preset", default="small", help="tiny, small, base or paper; default: small")
+    _add_data(commands)
     _add(commands, "doctor", "Print versions, threads, GL, disk and GPU for a bug report", _doctor)
     return parser
+
+
+def _add_data(commands: Any) -> None:
+    summary = "Check a dataset file, or convert it to another format"
+    data = commands.add_parser("data", help=summary, description=f"{summary}.")
+    verbs = data.add_subparsers(dest="verb", required=True, metavar="VERB")
+    check = _add(verbs, "check", "Print what a dataset file holds and every problem in it, each with a fix", _check)
+    check.add_argument("file", help="HDF5 or NPZ")
+    convert = _add(
+        verbs, "convert", "Write a dataset in another format, and say what was changed or left behind", _convert
+    )
+    convert.add_argument("source", metavar="IN", help="HDF5 or NPZ file, or minari:ID")
+    convert.add_argument("target", metavar="OUT", help="a new file ending in .h5, .hdf5 or .npz, or minari:ID")
+    for command in (check, convert):
+        command.add_argument("--task", help="robot and tier that the data came from, such as hopper-medium")
 
 
 class _LazyHelp(argparse.ArgumentParser):
@@ -193,3 +209,26 @@ def _doctor(namespace: argparse.Namespace, rest: list[str]) -> None:
 
     for name, value in report().items():
         Console().print(f"{name:<16} {value}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _check(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.data.inspection import inspect_file, render
+
+    inspection = inspect_file(namespace.file, task=namespace.task)
+    Console().print(render(inspection), soft_wrap=True)
+    if not inspection.usable:
+        raise SystemExit(2)
+
+
+def _convert(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.data.conversion import convert
+
+    dataset, findings = convert(namespace.source, namespace.target, task=namespace.task)
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"Wrote {len(dataset):,} transitions to {namespace.target}", markup=False)
+    for finding in findings:
+        console.print(f"{finding.kind}: {finding}", markup=False)

@@ -50,7 +50,7 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(["--help"]) == 0
     text = capsys.readouterr().out
-    assert [command for command in [*COMMANDS, *LIGHTNING] if f"\n    {command}" not in text] == []
+    assert [command for command in [*COMMANDS, *LIGHTNING, "data"] if f"\n    {command}" not in text] == []
 
 
 def test_help_is_quick() -> None:
@@ -74,6 +74,9 @@ def test_help_is_quick() -> None:
         (["train_policy", "cql"], "data/dataset.h5"),
         (["evaluate"], "data/dataset.h5"),
         (["params", "--preset", "smal"], "did you mean 'small'?"),
+        (["data", "convert", "nowhere.h5", "out.npz"], "nowhere.h5 is not a file"),
+        (["data", "convert", "nowhere.h5", "out.csv"], "name a dataset .h5, .hdf5 or .npz"),
+        (["data", "check", "nowhere.h5", "--task", "hoper-medium"], "did you mean 'hopper-medium'?"),
         (["init", "here", "--preset", "smal"], "did you mean 'small'?"),
     ],
 )

@@ -1,25 +1,27 @@
-"""D4RL-style HDF5 and NPZ files, in both directions.
+"""D4RL-style HDF5 and NPZ files, in both directions. docs/datasets.md names the columns.
 
-Keys: `observations` (N, S), `actions` (N, A), `rewards` (N,), `next_observations` (N, S), `terminals` (N,), `timeouts`
-(N,); optional `task`, `action_low` (A,) and `action_high` (A,), as attributes in HDF5 and as arrays in NPZ. Reading
-also takes the names `terminated` and `truncated`, and leaves other keys (`infos/...`, `metadata/...`) alone.
+Nothing in a file can run code or lead elsewhere: no objects, no pickle, no links, no storage outside the file, no
+filters but HDF5's own, no sizes that the file itself cannot hold.
 """
 
-import io
+import math
+import warnings
 import zipfile
-import zlib
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import h5py
 import numpy as np
 
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.validation import build_dataset
+from envtf_lit.data.validation import Finding, blocks, build_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.storage import replacing
 
+# the first name is the one that we write
 ALIASES = {
     "observations": ("observations",),
     "actions": ("actions",),
@@ -27,9 +29,31 @@ ALIASES = {
     "next_observations": ("next_observations",),
     "terminated": ("terminals", "terminated"),
     "truncated": ("timeouts", "truncated"),
+    "episode_index": ("episode_index", "episode", "episode_id", "episode_ids"),
 }
 ATTRIBUTES = ("task", "action_low", "action_high")
 HDF5_ENDINGS, NPZ_ENDINGS = (".h5", ".hdf5"), (".npz",)
+HDF5_FILTERS = {1, 2, 3, 4, 5, 6, 32000}  # gzip, shuffle, fletcher32, szip, nbit, scaleoffset, lzf: no plugins
+# no log of numbers shrinks to a 200th: a file that declares more than this, and more than that, is damaged or a trap
+BOMB_RATIO, BOMB_BYTES = 200, 256 << 20
+LARGEST_ATTRIBUTE = 1 << 20  # bytes
+
+
+@dataclass
+class Raw:
+    """What a file holds, as it lies there.
+
+    Attributes:
+        columns: by our names; arrays, or what has `shape`, `dtype` and slices like one while the file is open.
+        attributes: `task`, `action_low`, `action_high`, where there are such.
+        ignored: names of everything else.
+        broken: columns that are there and cannot be read, by our names, and why.
+    """
+
+    columns: dict[str, Any] = field(default_factory=dict)
+    attributes: dict[str, Any] = field(default_factory=dict)
+    ignored: list[str] = field(default_factory=list)
+    broken: dict[str, Finding] = field(default_factory=dict)
 
 
 def save_dataset(dataset: OfflineDataset, path: str | Path) -> None:
@@ -39,11 +63,11 @@ def save_dataset(dataset: OfflineDataset, path: str | Path) -> None:
         UserError: another ending, a full disk, or a place that cannot be written. Nothing half-written stays.
     """
     path = Path(path)
-    arrays = {names[0]: getattr(dataset, column) for column, names in ALIASES.items()}
+    write = _write_hdf5 if is_hdf5(path) else _write_npz
+    arrays = {ALIASES[column][0]: getattr(dataset, column) for column in ALIASES if column != "episode_index"}
     attributes = {name: getattr(dataset, name) for name in ATTRIBUTES if getattr(dataset, name) is not None}
-    content = _hdf5_bytes(arrays, attributes) if _is_hdf5(path) else _npz_bytes({**arrays, **attributes})
     with replacing(path) as temporary:
-        temporary.write_bytes(content)
+        write(temporary, arrays, attributes)
 
 
 def load_dataset(path: str | Path, *, task: str | None = None) -> OfflineDataset:
@@ -61,79 +85,180 @@ def load_dataset(path: str | Path, *, task: str | None = None) -> OfflineDataset
     Raises:
         UserError: the file is missing, damaged, incomplete, inconsistent, or does not fit the task.
     """
+    with open_raw(path) as raw:
+        return build_dataset(raw.columns, raw.attributes, task=task, source=str(path), broken=raw.broken)
+
+
+@contextmanager
+def open_raw(path: str | Path) -> Iterator[Raw]:
+    """Opens a file for reading its columns; they may be used inside the block alone.
+
+    Raises:
+        UserError: the file is missing, may not be read, is none of its kind, or is made to do harm.
+    """
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path} is not a file: check the path, or run the stage that writes it.")
-    read, kind = (_read_hdf5, "an HDF5") if _is_hdf5(path) else (_read_npz, "an NPZ")
+    opening, kind = (_open_hdf5, "an HDF5") if is_hdf5(path) else (_open_npz, "an NPZ")
+    file = None
     try:
-        columns, attributes = read(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what is odd in a file, the findings speak
+            file, raw = opening(path)
     except UserError:
         raise
     except PermissionError:
         raise UserError(f"{path} may not be read: change its permissions.") from None
-    except (
-        OSError,
-        ValueError,
-        RuntimeError,
-        KeyError,
-        TypeError,
-        MemoryError,
-        EOFError,
-        NotImplementedError,
-    ) as error:
-        raise UserError(f"{path} is damaged or not {kind} file ({error}): fetch or write it anew.") from None
-    except (zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is damaged or not {kind} file ({error}): fetch or write it anew.") from None
-    return build_dataset(columns, attributes, task=task, source=str(path))
+    except Exception as error:  # whatever a decoder of foreign bytes raises
+        reason = " ".join(str(error).split())[:300]
+        raise UserError(f"{path} is damaged or not {kind} file ({reason}): fetch or write it anew.") from None
+    try:
+        yield raw
+    finally:
+        file.close()
 
 
-def _is_hdf5(path: Path) -> bool:
+def is_hdf5(path: Path) -> bool:
+    """Whether the ending says HDF5 rather than NPZ.
+
+    Raises:
+        UserError: it says neither.
+    """
     ending = path.suffix.lower()
     if ending not in HDF5_ENDINGS + NPZ_ENDINGS:
         raise UserError(f"{path} ends in {ending!r}: name a dataset .h5, .hdf5 or .npz.")
     return ending in HDF5_ENDINGS
 
 
-def _hdf5_bytes(arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> bytes:
-    # in memory first: HDF5's own errors on a full disk come late and have no errno
-    buffer = io.BytesIO()
-    with h5py.File(buffer, "w") as file:
+def _write_hdf5(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, Any]) -> None:
+    # through Python's own file: a full disk is then an OSError with its number, and early
+    with path.open("w+b") as stream, h5py.File(stream, "w") as file:
         for name, array in arrays.items():
-            file.create_dataset(name, data=array, track_times=False)
+            column = file.create_dataset(name, array.shape, array.dtype, track_times=False)
+            for block in blocks(len(array), array[:1].nbytes):
+                column[block] = array[block]
         file.attrs.update(attributes)
-    return buffer.getvalue()
 
 
-def _npz_bytes(arrays: Mapping[str, Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # numpy dates every member 1980
-    return buffer.getvalue()
+def _write_npz(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, Any]) -> None:
+    with path.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, **arrays, **attributes)  # numpy dates every member 1980
 
 
-def _find_names(present: Iterable[str]) -> dict[str, str]:
-    """Our column to the name it has in a file, for those that are there."""
-    there = set(present)
-    return {column: name for column, names in ALIASES.items() if (name := next((n for n in names if n in there), None))}
+def _find_names(present: Iterable[str]) -> tuple[dict[str, str], list[str]]:
+    """Our column to the name it has in a file, for those that are there; and the names of nothing of ours."""
+    there = list(present)
+    found = {
+        column: name for column, names in ALIASES.items() if (name := next((n for n in names if n in there), None))
+    }
+    return found, [name for name in there if name not in found.values() and name not in ATTRIBUTES]
 
 
-def _read_hdf5(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    with h5py.File(path, "r") as file:
-        names = _find_names(file)  # iterates over names alone, following no link
-        columns = {column: _read_hdf5_array(file, name, path) for column, name in names.items()}
-        return columns, {name: file.attrs[name] for name in ATTRIBUTES if name in file.attrs}
+def _check_size(raw: Raw, path: Path, declared: dict[str, int]) -> None:
+    """Refuses sizes (bytes of each column) that make a small file a large one."""
+    total, stored = sum(declared.values()), path.stat().st_size
+    if total > BOMB_BYTES and total > BOMB_RATIO * stored:
+        name = max(declared, key=lambda key: declared[key])
+        raise UserError(
+            f"{path} has {stored:,} bytes and declares {declared[name]:,} of {name!r}: it is damaged or a trap that "
+            "fills the memory; fetch or write it anew."
+        )
 
 
-def _read_hdf5_array(file: h5py.File, name: str, path: Path) -> np.ndarray:
-    """A plain array of this very file: nothing that leads to another file, no objects."""
+# HDF5
+
+
+def _open_hdf5(path: Path) -> tuple[h5py.File, Raw]:
+    file = h5py.File(path, "r")
+    try:
+        raw = Raw()
+        names, raw.ignored = _find_names(file)  # iterates over names alone, following no link
+        for column, name in names.items():
+            item = _plain_hdf5(file, name)
+            if item is None:
+                what = f"there is no plain numeric array under {name!r}"
+                raw.broken[column] = Finding("error", what, "store one, without links, objects or foreign filters")
+            else:
+                raw.columns[column] = item
+        _check_size(raw, path, {name: _hdf5_bytes(item) for name, item in raw.columns.items()})
+        for name in ATTRIBUTES:
+            if name in file.attrs:
+                raw.attributes[name] = _hdf5_attribute(file, name)
+    except BaseException:
+        file.close()
+        raise
+    return file, raw
+
+
+def _plain_hdf5(file: h5py.File, name: str) -> h5py.Dataset | None:
+    """A plain array of this very file: nothing that leads to another file, no objects, no code of plugins."""
     item = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
-    if isinstance(item, h5py.Dataset) and item.shape is not None and item.dtype.kind in "biuf":
-        outside = item.external or item.is_virtual
-        if not outside:
-            return np.asarray(item)
-    raise UserError(f"{path} holds no plain numeric array under {name!r}: store one, without links or objects.")
+    if not isinstance(item, h5py.Dataset) or item.shape is None or item.dtype.kind not in "biuf":
+        return None
+    plan = item.id.get_create_plist()
+    filters = {plan.get_filter(index)[0] for index in range(plan.get_nfilters())}
+    return None if item.external or item.is_virtual or filters - HDF5_FILTERS else item
 
 
-def _read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        columns = {column: file[name] for column, name in _find_names(file.files).items()}
-        return columns, {name: file[name] for name in ATTRIBUTES if name in file.files}
+def _hdf5_bytes(item: h5py.Dataset) -> int:
+    """What reading takes: all of it, and at least one chunk."""
+    return item.dtype.itemsize * max(math.prod(item.shape), math.prod(item.chunks or ()))
+
+
+def _hdf5_attribute(file: h5py.File, name: str) -> Any:
+    attribute = file.attrs.get_id(name)
+    plain = attribute.dtype.kind in "biufSU" or h5py.check_string_dtype(attribute.dtype) is not None
+    if not plain or math.prod(attribute.shape) * attribute.dtype.itemsize > LARGEST_ATTRIBUTE:
+        return np.array("neither a short text nor a few numbers")
+    return file.attrs[name]
+
+
+# NPZ: a zip archive of arrays
+
+
+def _open_npz(path: Path) -> tuple[zipfile.ZipFile, Raw]:
+    archive = zipfile.ZipFile(path)
+    try:
+        raw = Raw()
+        for member in archive.namelist():
+            if PurePosixPath(member).is_absolute() or ".." in member.replace("\\", "/").split("/"):
+                raise UserError(f"{path} has a member {member[:80]!r} that leaves its folder: do not trust this file.")
+        members = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
+        names, raw.ignored = _find_names(members)
+        declared = {name: archive.getinfo(members[name]).file_size for name in names.values()}
+        _check_size(raw, path, declared)
+        for column, name in names.items():
+            _read_member(raw, archive, members[name], column)
+        for name in ATTRIBUTES:
+            if name in members and archive.getinfo(members[name]).file_size <= LARGEST_ATTRIBUTE:
+                with archive.open(members[name]) as stream:
+                    raw.attributes[name] = np.lib.format.read_array(stream, allow_pickle=False)
+    except BaseException:
+        archive.close()
+        raise
+    return archive, raw
+
+
+def _read_member(raw: Raw, archive: zipfile.ZipFile, member: str, column: str) -> None:
+    try:
+        with archive.open(member) as stream:
+            shape, _, dtype = _read_header(stream)
+            if dtype.kind not in "biuf":
+                raw.broken[column] = Finding("error", f"{column!r} holds {dtype} values", "store plain numbers")
+                return
+            if math.prod(shape) * dtype.itemsize > archive.getinfo(member).file_size:
+                raise ValueError(f"it declares shape {shape} and holds less")
+        with archive.open(member) as stream:
+            raw.columns[column] = np.lib.format.read_array(stream, allow_pickle=False)
+    except Exception as error:  # whatever a decoder of foreign bytes raises
+        reason = " ".join(str(error).split())[:200]
+        raw.broken[column] = Finding("error", f"{column!r} is damaged ({reason})", "fetch or write the file anew")
+
+
+def _read_header(stream: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        return np.lib.format.read_array_header_1_0(stream)
+    if version == (2, 0):
+        return np.lib.format.read_array_header_2_0(stream)
+    raise ValueError(f"version {version} of the format is for records, not numbers")

@@ -1,7 +1,9 @@
 """Every check a dataset passes once, on its way in: what comes out is complete, finite and consistent."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping, Set
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Literal
 
 import numpy as np
 
@@ -9,103 +11,208 @@ from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
 from envtf_lit.errors import UserError
 from envtf_lit.tasks import TASKS, Task, get_task
 
-RANKS = {"observations": 2, "actions": 2, "rewards": 1, "next_observations": 2, "terminated": 1, "truncated": 1}
-FLAGS = ("terminated", "truncated")
-NEEDED = ("observations", "actions", "rewards", "terminated", "truncated")
+RANKS = {
+    "observations": 2,
+    "actions": 2,
+    "rewards": 1,
+    "next_observations": 2,
+    "terminated": 1,
+    "truncated": 1,
+    "episode_index": 1,
+}
+NUMBERS = ("observations", "actions", "rewards", "next_observations")
+FLAGS = {"terminated": "terminals", "truncated": "timeouts"}  # and what D4RL calls them
+NEEDED = ("observations", "actions", "rewards")
 ACTION_TOLERANCE = 1e-5
+BLOCK_BYTES = 16 << 20  # columns are looked at in blocks of about this size
+
+Kind = Literal["error", "warning", "note"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing found in a dataset.
+
+    Attributes:
+        kind: `error` makes it unusable, a `warning` is probably not meant, a `note` says what reading changes.
+        what: as a clause without a full stop, with the values.
+        fix: what to do about it; empty where there is nothing to do.
+    """
+
+    kind: Kind
+    what: str
+    fix: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.fix}" if self.fix else self.what
 
 
 def build_dataset(
-    columns: Mapping[str, np.ndarray], attributes: Mapping[str, Any], *, task: str | None, source: str
+    columns: Mapping[str, Any],
+    attributes: Mapping[str, Any],
+    *,
+    task: str | None,
+    source: str,
+    broken: Mapping[str, Finding] = MappingProxyType({}),
 ) -> OfflineDataset:
     """Checks columns as read from a file and makes the dataset.
 
     Args:
-        columns: by the names of `COLUMNS`; `next_observations` may be missing.
-        attributes: `task`, `action_low`, `action_high`, each optional.
-        task: overrides the name in `attributes`.
+        columns: see `examine`.
+        attributes: see `examine`.
+        task: see `examine`.
         source: what to call the data in messages.
+        broken: see `examine`.
 
     Raises:
-        UserError: see `load_dataset`.
+        UserError: the first error that `examine` finds.
     """
-    _check_shapes(columns, source)
-    data = {name: _convert(name, values, source) for name, values in columns.items()}
-    data = _close_episodes(data)
-    known = _find_task(task, attributes.get("task"), source)
-    _check_robot(data, known, source)
-    low, high = _action_limits(attributes, known, data["actions"].shape[1], source)
-    data["actions"] = _inside(data["actions"], low, high, source)
-    starts = starts_from_ends(data["terminated"] | data["truncated"])
-    complete = "next_observations" in data
-    _check_lengths(starts, len(data["rewards"]), source, least=2 if complete else 3)
-    if not complete:
-        data, starts = _shift(data, starts)
-    return OfflineDataset(
-        **data,
+    dataset, findings = examine(columns, attributes, task=task, broken=broken)
+    if dataset is None:
+        raise UserError(f"{source}: {next(finding for finding in findings if finding.kind == 'error')}.")
+    return dataset
+
+
+def examine(
+    columns: Mapping[str, Any],
+    attributes: Mapping[str, Any],
+    *,
+    task: str | None = None,
+    broken: Mapping[str, Finding] = MappingProxyType({}),
+) -> tuple[OfflineDataset | None, list[Finding]]:
+    """Checks columns as read from a file, all of them, and makes the dataset if there is no error.
+
+    Args:
+        columns: arrays, or what has `shape`, `dtype` and slices like one, by the names in `RANKS`.
+        attributes: `task`, `action_low`, `action_high`, each optional.
+        task: overrides the name in `attributes`.
+        broken: columns that could not be read, by name, and why.
+
+    Returns:
+        The dataset, None if anything in the columns is an error; and everything found.
+
+    Raises:
+        UserError: `task` is none of ours.
+    """
+    findings = [*broken.values(), *_missing({*columns, *broken}), *_misshapen(columns)]
+    data: dict[str, np.ndarray] = {}
+    for name, values in columns.items():
+        if len(values.shape) == RANKS[name] and 0 not in values.shape:
+            data[name] = _read(name, values, findings)
+    known = _find_task(task, attributes.get("task"), findings)
+    if not _check_robot(data, known, findings):
+        known = None  # whose action limits mean nothing then
+    low, high = _action_limits(attributes, known, data, findings)
+    if "actions" in data:
+        data["actions"] = _inside(data["actions"], low, high, findings)
+    starts = np.zeros(0, np.int64)
+    if not _failed(findings):
+        starts = _find_episodes(data, findings)
+    if not _failed(findings) and "next_observations" not in data:
+        data, starts = _shift(data, starts, findings)
+    if _failed(findings):
+        return None, findings
+    dataset = OfflineDataset(
+        **{name: data[name] for name in COLUMNS},
         episode_starts=starts,
         action_low=low,
         action_high=high,
         task=known.name if known else None,
     )
+    return dataset, findings
 
 
-def _check_shapes(columns: Mapping[str, np.ndarray], source: str) -> None:
+def _failed(findings: list[Finding]) -> bool:
+    return any(finding.kind == "error" for finding in findings)
+
+
+def blocks(rows: int, row_bytes: int = 4) -> Iterator[slice]:
+    """Slices that cover [0, rows), each of about `BLOCK_BYTES`."""
+    size = max(1, BLOCK_BYTES // max(1, row_bytes))
+    return (slice(begin, min(begin + size, rows)) for begin in range(0, rows, size))
+
+
+def _missing(columns: Set[str]) -> Iterator[Finding]:
     for name in NEEDED:
         if name not in columns:
-            extra = {"terminated": " (or 'terminals')", "truncated": " (or 'timeouts')"}.get(name, "")
-            raise UserError(f"{source} has no {name!r}{extra}: a dataset needs {', '.join(NEEDED)}.")
+            yield Finding("error", f"there are no {name!r}", f"a dataset needs {', '.join(NEEDED)} and episode ends")
+    for name, other in FLAGS.items():
+        if name not in columns and "episode_index" not in columns:
+            fix = "store both flags, all False where it never happens, or an 'episode_index'"
+            yield Finding("error", f"there is no {name!r} (or {other!r})", fix)
+
+
+def _misshapen(columns: Mapping[str, Any]) -> Iterator[Finding]:
     for name, values in columns.items():
-        if values.ndim != RANKS[name]:
+        if len(values.shape) != RANKS[name]:
             want = "(N, dimensions)" if RANKS[name] == 2 else "(N,)"
-            raise UserError(f"{source}: {name!r} has shape {values.shape}: reshape it to {want}.")
-    rows = len(columns["rewards"])
-    for name, values in columns.items():
-        if len(values) != rows:
-            raise UserError(
-                f"{source}: {name!r} has {len(values)} rows and 'rewards' has {rows}: write all columns equally long."
-            )
-        if 0 in values.shape:
-            raise UserError(f"{source}: {name!r} has shape {values.shape}, which is empty: collect some transitions.")
-    successors = columns.get("next_observations")
-    if successors is not None and successors.shape != columns["observations"].shape:
-        raise UserError(
-            f"{source}: 'next_observations' has shape {successors.shape} and 'observations' has "
-            f"{columns['observations'].shape}: they must be equal."
-        )
+            yield Finding("error", f"{name!r} has shape {values.shape}", f"reshape it to {want}")
+        elif 0 in values.shape:
+            yield Finding("error", f"{name!r} has shape {values.shape}, which is empty", "collect some transitions")
+    lengths = {name: values.shape[0] for name, values in columns.items() if values.shape}
+    rows = lengths.get("rewards")
+    for name, length in lengths.items():
+        if rows is not None and length != rows:
+            what = f"{name!r} has {length} rows and 'rewards' has {rows}"
+            yield Finding("error", what, "write all columns equally long")
+    here, there = (columns[name].shape if name in columns else None for name in ("observations", "next_observations"))
+    if here is not None and there is not None and here != there:
+        yield Finding("error", f"'next_observations' has shape {there} and 'observations' {here}", "make them equal")
 
 
-def _convert(name: str, values: np.ndarray, source: str) -> np.ndarray:
-    """To float32 or bool."""
+def _read(name: str, values: Any, findings: list[Finding]) -> np.ndarray:
+    """As float32, bool or int64, block by block; what is wrong with the values goes to the findings."""
+    dtype = np.float32 if name in NUMBERS else bool if name in FLAGS else np.int64
     if values.dtype.kind not in "biuf":
-        raise UserError(f"{source}: {name!r} holds {values.dtype} values: store plain numbers.")
+        findings.append(Finding("error", f"{name!r} holds {values.dtype} values", "store plain numbers"))
+        return np.zeros(values.shape, dtype)
+    if dtype is np.float32 and values.dtype.itemsize > 4:
+        findings.append(Finding("note", f"{name!r} is {values.dtype} and becomes float32"))
+    keep = isinstance(values, np.ndarray) and values.dtype == dtype and values.flags.c_contiguous
+    column = values if keep else np.empty(values.shape, dtype)
+    bad, first = 0, -1
+    for block in blocks(len(column), column[:1].nbytes):
+        try:
+            part = np.asarray(values[block])
+        except Exception as error:  # whatever a decoder of damaged bytes raises
+            findings.append(Finding("error", f"{name!r} cannot be read ({_one_line(error)})", "write the file anew"))
+            break
+        wrong = ~_sound(part, dtype)
+        if wrong.any():
+            first = first if bad else block.start + int(wrong.argmax())
+            bad += int(wrong.sum())
+        if not keep:
+            with np.errstate(over="ignore", invalid="ignore"):
+                column[block] = part
+    if bad:
+        findings.append(_unsound(name, bad, first, np.asarray(values[first : first + 1])))
+    return column
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def _sound(part: np.ndarray, dtype: type) -> np.ndarray:
+    """(n,) whether each row can be stored as that type: finite in float32, 0 or 1, a whole number."""
+    if dtype is bool:
+        return (part == 0) | (part == 1)
+    if dtype is np.int64:
+        return np.logical_and(np.abs(part) < 2**53, part == np.round(part))
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite
+        return np.isfinite(part.astype(np.float32, copy=False)).reshape(len(part), -1).all(axis=1)
+
+
+def _unsound(name: str, bad: int, first: int, value: np.ndarray) -> Finding:
     if name in FLAGS:
-        if (odd := np.flatnonzero((values != 0) & (values != 1))).size:
-            raise UserError(f"{source}: {name!r} is {values[odd[0]]} at row {odd[0]}: flags must be 0 or 1.")
-        return values.astype(bool)
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is named below
-        numbers = np.ascontiguousarray(values, dtype=np.float32)
-    bad = ~np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1)
-    if bad.any():
-        row = int(bad.argmax())
-        raise UserError(
-            f"{source}: {name!r} has NaN or infinite values, first at row {row} ({int(bad.sum())} rows in all): "
-            "remove those episodes."
-        )
-    return numbers
+        return Finding("error", f"{name!r} is {value[0]} at row {first} ({bad} rows in all)", "flags must be 0 or 1")
+    if name == "episode_index":
+        return Finding("error", f"{name!r} is {value[0]} at row {first}", "number the episodes with whole numbers")
+    what = f"{name!r} has NaN or infinite values, first at row {first} ({bad} rows in all)"
+    return Finding("error", what, "remove those episodes")
 
 
-def _close_episodes(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """A log that stops in mid-episode is truncated there; a lone row after the last ending is no episode and goes."""
-    ended = data["terminated"] | data["truncated"]
-    if not ended[-1] and len(ended) > 1 and ended[-2]:
-        return {name: values[:-1] for name, values in data.items()}
-    if not ended[-1]:
-        data["truncated"][-1] = True
-    return data
-
-
-def _find_task(asked: str | None, stored: Any, source: str) -> Task | None:
+def _find_task(asked: str | None, stored: Any, findings: list[Finding]) -> Task | None:
     """The task asked for, else the one named in the file if it is one of ours."""
     name = stored.decode(errors="replace") if isinstance(stored, bytes) else str(stored)
     known = TASKS.get(name)
@@ -113,61 +220,120 @@ def _find_task(asked: str | None, stored: Any, source: str) -> Task | None:
         return known
     task = get_task(asked)
     if known is not None and known.robot != task.robot:
-        raise UserError(f"{source} was made for {known.name}, not for {task.name}: set the task to {known.name}.")
+        what = f"the data was made for {known.name}, not for {task.name}"
+        findings.append(Finding("error", what, f"set the task to {known.name}"))
     return task
 
 
-def _check_robot(data: Mapping[str, np.ndarray], task: Task | None, source: str) -> None:
+def _check_robot(data: Mapping[str, np.ndarray], task: Task | None, findings: list[Finding]) -> bool:
+    """Whether the dimensions are the robot's."""
+    if task is None or "observations" not in data or "actions" not in data:
+        return True
     found = (data["observations"].shape[1], data["actions"].shape[1])
-    if task is not None and found != (task.robot.observation_dim, task.robot.action_dim):
-        raise UserError(
-            f"{source} has {found[0]} observation and {found[1]} action dimensions, and {task.robot.env_id} has "
-            f"{task.robot.observation_dim} and {task.robot.action_dim}: choose the task that the data came from."
-        )
+    wanted = (task.robot.observation_dim, task.robot.action_dim)
+    if found != wanted:
+        what = f"there are {found[0]} observation and {found[1]} action dimensions, and {task.robot.env_id} has"
+        fix = "choose the task that the data came from, or null for a robot of your own"
+        findings.append(Finding("error", f"{what} {wanted[0]} and {wanted[1]}", fix))
+    return found == wanted
 
 
 def _action_limits(
-    attributes: Mapping[str, Any], task: Task | None, action_dim: int, source: str
+    attributes: Mapping[str, Any], task: Task | None, data: Mapping[str, np.ndarray], findings: list[Finding]
 ) -> tuple[np.ndarray, np.ndarray]:
+    if "actions" not in data:
+        return np.zeros(0, np.float32), np.zeros(0, np.float32)
+    action_dim = data["actions"].shape[1]
     limit = task.robot.action_limit if task else 1.0
     limits = []
     for name, default in (("action_low", -limit), ("action_high", limit)):
         values = np.asarray(attributes.get(name, np.full(action_dim, default)))
         if values.dtype.kind not in "iuf" or values.shape != (action_dim,) or not np.isfinite(values).all():
-            raise UserError(f"{source}: {name!r} is {values!s:.80}: it must be {action_dim} finite numbers.")
-        limits.append(values.astype(np.float32))
-    if not (limits[0] < limits[1]).all():
-        raise UserError(f"{source}: 'action_low' {limits[0]} is not below 'action_high' {limits[1]}: mend the limits.")
-    return limits[0], limits[1]
+            findings.append(Finding("error", f"{name!r} is {values!s:.80}", f"it must be {action_dim} finite numbers"))
+            values = np.full(action_dim, default)
+        with np.errstate(over="ignore"):
+            limits.append(values.astype(np.float32))
+    low, high = limits
+    if not (np.isfinite(limits).all() and (low < high).all()):
+        findings.append(Finding("error", f"'action_low' {low} is not below 'action_high' {high}", "mend the limits"))
+    return low, high
 
 
-def _inside(actions: np.ndarray, low: np.ndarray, high: np.ndarray, source: str) -> np.ndarray:
-    outside = ((actions < low - ACTION_TOLERANCE) | (actions > high + ACTION_TOLERANCE)).any(axis=1)
-    if outside.any():
-        row = int(outside.argmax())
-        raise UserError(
-            f"{source}: actions reach from {actions.min():g} to {actions.max():g}, outside the action space "
-            f"[{low.min():g}, {high.max():g}], first at row {row}: rescale them, or store 'action_low' and "
-            "'action_high'."
-        )
-    return np.clip(actions, low, high)
+def _inside(actions: np.ndarray, low: np.ndarray, high: np.ndarray, findings: list[Finding]) -> np.ndarray:
+    """Actions in their space: what lies a rounding error outside is moved to its edge."""
+    first, least, most, over = -1, np.inf, -np.inf, False
+    for block in blocks(len(actions), actions[:1].nbytes):
+        part = actions[block]
+        outside = ((part < low - ACTION_TOLERANCE) | (part > high + ACTION_TOLERANCE)).any(axis=1)
+        if outside.any() and first < 0:
+            first = block.start + int(outside.argmax())
+        least, most = min(least, part.min()), max(most, part.max())
+        over = over or bool(((part < low) | (part > high)).any())
+    if first >= 0:
+        space = f"outside the action space [{low.min():g}, {high.max():g}], first at row {first}"
+        fix = "rescale them, or store 'action_low' and 'action_high'"
+        findings.append(Finding("error", f"actions reach from {least:g} to {most:g}, {space}", fix))
+    return np.clip(actions, low, high) if over else actions
 
 
-def _check_lengths(starts: np.ndarray, rows: int, source: str, *, least: int) -> None:
-    short = np.flatnonzero(np.diff(starts, append=rows) < least)
-    if short.size:
-        why = "" if least == 2 else " (three without 'next_observations')"
-        raise UserError(
-            f"{source}: {short.size} of {len(starts)} episodes have fewer than two steps{why}, first at row "
-            f"{starts[short[0]]}: leave such episodes out."
-        )
+def _find_episodes(data: dict[str, np.ndarray], findings: list[Finding]) -> np.ndarray:
+    """(E,) starts, and the flags made to mark the last row of every episode.
+
+    An episode ends where a flag is set or the index changes. An end without a flag is a truncation.
+    """
+    rows = len(data["rewards"])
+    flags = {name: data.get(name, np.zeros(rows, bool)).copy() for name in FLAGS}
+    ends = flags["terminated"] | flags["truncated"]
+    if "episode_index" in data:
+        ends = _indexed_ends(data["episode_index"], ends, findings)
+    elif not ends[-1]:
+        findings.append(Finding("note", "the log stops inside an episode, whose last row counts as truncated"))
+    ends[-1] = True
+    flags["truncated"] |= ends & ~flags["terminated"]
+    data |= flags
+    both = int((data["terminated"] & data["truncated"]).sum())
+    if both:
+        what = f"{both} rows are both terminated and truncated"
+        findings.append(Finding("note", f"{what}; they count as terminated: no future reward"))
+    return starts_from_ends(ends)
 
 
-def _shift(data: dict[str, np.ndarray], starts: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _indexed_ends(index: np.ndarray, flagged: np.ndarray, findings: list[Finding]) -> np.ndarray:
+    """(N,) the last rows of the index's episodes, which every flag must agree with."""
+    ends = np.append(index[1:] != index[:-1], True)
+    names, first = np.unique(index[starts_from_ends(ends)], return_index=True)
+    if len(names) < ends.sum():
+        again = np.setdiff1d(np.arange(int(ends.sum())), first)[0]
+        row = starts_from_ends(ends)[again]
+        what = f"'episode_index' comes back to {index[row]} at row {row}, after other episodes"
+        findings.append(Finding("error", what, "write each episode's rows one after the other"))
+    inside = np.flatnonzero(flagged & ~ends)
+    if inside.size:
+        what = f"an episode ends at row {inside[0]} by its flags and goes on by 'episode_index' ({inside.size} rows)"
+        findings.append(Finding("error", what, "make them agree, or leave one out"))
+    return ends
+
+
+def _shift(
+    data: dict[str, np.ndarray], starts: np.ndarray, findings: list[Finding]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Successors from the following row; each episode loses its last row, which has none, and so ends truncated."""
-    successors = np.roll(data["observations"], -1, axis=0)
-    last = np.append(starts[1:], len(successors)) - 1
-    kept = {name: np.delete(values, last, axis=0) for name, values in {**data, "next_observations": successors}.items()}
-    starts = starts - np.arange(len(starts))
-    kept["truncated"][np.append(starts[1:], len(kept["rewards"])) - 1] = True
-    return {name: kept[name] for name in COLUMNS}, starts
+    rows = len(data["rewards"])
+    last = np.zeros(rows, bool)
+    last[np.append(starts[1:], rows) - 1] = True
+    kept = np.flatnonzero(~last)
+    if not kept.size:
+        what = "there is no 'next_observations', and every episode is a single row"
+        findings.append(Finding("error", what, "store 'next_observations'"))
+        return data, starts
+    lost = int((data["terminated"] & last).sum())
+    what = f"there is no 'next_observations': the last row of each of {last.sum()} episodes is left out"
+    findings.append(
+        Finding("note", f"{what}, and with it {lost} terminations", "store 'next_observations' to keep them")
+    )
+    episode = np.repeat(np.arange(len(starts)), np.diff(starts, append=rows))[kept]
+    ends = np.append(episode[1:] != episode[:-1], True)
+    shifted = {name: data[name][kept] for name in ("observations", "actions", "rewards")}
+    shifted["next_observations"] = data["observations"][kept + 1]
+    shifted["terminated"], shifted["truncated"] = np.zeros(len(kept), bool), ends
+    return shifted, starts_from_ends(ends)

@@ -1,0 +1,44 @@
+"""Datasets from one format to another, and what that changes."""
+
+from pathlib import Path
+
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.formats import is_hdf5, open_raw, save_dataset
+from envtf_lit.data.validation import Finding, examine
+from envtf_lit.errors import UserError
+
+
+def convert(source: str, target: str, *, task: str | None = None) -> tuple[OfflineDataset, list[Finding]]:
+    """Reads a dataset and writes it as something else.
+
+    HDF5 and NPZ hold the same columns, bit for bit, so that nothing is lost between them.
+
+    Args:
+        source: an HDF5 or NPZ file.
+        target: a new file ending in .h5, .hdf5 or .npz.
+        task: such as `hopper-medium-replay`; None takes the name in the source, where there is one.
+
+    Returns:
+        The dataset, and what was changed or left behind.
+
+    Raises:
+        UserError: the source cannot be used, or the target exists or cannot be written. Nothing half-written stays.
+    """
+    is_hdf5(Path(target))
+    if Path(target).exists():
+        raise UserError(f"{target} exists already: give the new file another name, or delete this one.")
+    dataset, findings = _read(source, task)
+    save_dataset(dataset, target)
+    return dataset, findings
+
+
+def _read(source: str, task: str | None) -> tuple[OfflineDataset, list[Finding]]:
+    with open_raw(source) as raw:
+        dataset, findings = examine(raw.columns, raw.attributes, task=task, broken=raw.broken)
+    if dataset is None:
+        worst = next(finding for finding in findings if finding.kind == "error")
+        raise UserError(f"{source}: {worst}; `envtf data check` lists all that is wrong.")
+    if raw.ignored:
+        names = ", ".join(raw.ignored[:8]) + (", …" if len(raw.ignored) > 8 else "")
+        findings.append(Finding("note", f"left behind, for a dataset has no such columns: {names}"))
+    return dataset, findings

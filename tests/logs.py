@@ -1,0 +1,50 @@
+"""A small log as a user might have it, all noise: columns, and files of them."""
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from envtf_lit.data.dataset import COLUMNS, OfflineDataset
+
+KEYS = ("observations", "actions", "rewards", "next_observations", "terminals", "timeouts")
+Columns = dict[str, Any]
+
+
+def columns(observation_dim: int = 11, action_dim: int = 3) -> Columns:
+    """Three episodes of 4, 3 and 5 rows: terminated, timed out, cut by the end of the log."""
+    rng = np.random.default_rng(0)
+    rows = 12
+    flags = np.zeros((2, rows), bool)
+    flags[0, 3] = flags[1, 6] = True
+    return {
+        "observations": rng.normal(size=(rows, observation_dim)).astype(np.float32),
+        "actions": rng.uniform(-1, 1, (rows, action_dim)).astype(np.float32),
+        "rewards": rng.normal(size=rows).astype(np.float32),
+        "next_observations": rng.normal(size=(rows, observation_dim)).astype(np.float32),
+        "terminals": flags[0],
+        "timeouts": flags[1],
+    }
+
+
+def write(path: Path, content: Columns) -> Path:
+    """The content as HDF5 or NPZ, by the path's ending."""
+    if path.suffix == ".npz":
+        np.savez(path, allow_pickle=True, **content)
+        return path
+    with h5py.File(path, "w") as file:
+        for name, value in content.items():
+            if name in ("task", "action_low", "action_high"):
+                file.attrs[name] = value
+            else:
+                file[name] = value
+    return path
+
+
+def assert_equal(first: OfflineDataset, second: OfflineDataset) -> None:
+    for name in (*COLUMNS, "episode_starts", "action_low", "action_high"):
+        one, two = getattr(first, name), getattr(second, name)
+        assert one.dtype == two.dtype, name
+        assert np.array_equal(one, two), name
+    assert first.task == second.task

@@ -1,0 +1,167 @@
+"""`envtf data check` and `envtf data convert`: what is allowed and probably not meant, the report, the exit status."""
+
+import io
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from logs import assert_equal, columns, write
+from rich.console import Console
+from walker import walker_dataset
+
+from envtf_lit.cli import main
+from envtf_lit.data.conversion import convert
+from envtf_lit.data.formats import load_dataset, save_dataset
+from envtf_lit.data.inspection import inspect_file, quality, render
+from envtf_lit.errors import UserError
+
+
+def said(dataset, **changes: np.ndarray) -> str:
+    """The warnings about a dataset with some columns changed."""
+    for name, values in changes.items():
+        object.__setattr__(dataset, name, values)
+    return "\n".join(f"{finding.kind}: {finding}" for finding in quality(dataset))
+
+
+def test_a_sound_log_gives_no_warning():
+    assert said(walker_dataset(episodes=12)) == ""
+
+
+def test_few_and_single_step_episodes():
+    assert "error: there is one episode" in said(walker_dataset(episodes=1))
+    assert "warning: there are 4 episodes" in said(walker_dataset(episodes=4))
+    assert "10 of 10 episodes are a single step" in said(walker_dataset(episodes=10, length=1))
+
+
+def test_terminations_at_a_time_limit():
+    dataset = walker_dataset()
+    terminated = dataset.terminated | dataset.truncated
+    assert "warning: 12 terminated episodes all have the greatest length, 20 steps" in said(
+        dataset, terminated=terminated
+    )
+
+
+def test_terminations_at_different_lengths_are_none_of_a_time_limit():
+    dataset = walker_dataset()
+    starts = np.array([0, *range(15, 240, 20)])
+    ends = np.zeros(240, bool)
+    ends[np.append(starts[1:], 240) - 1] = True
+    text = said(dataset, episode_starts=starts, terminated=ends, truncated=np.zeros(240, bool))
+    assert "every episode is terminated" not in text
+    assert "11 terminated episodes" in text  # all but the first and the last have twenty steps
+
+
+def test_an_episode_end_without_a_flag_is_seen_as_a_gap():
+    dataset = walker_dataset()
+    starts = np.delete(dataset.episode_starts, 3)
+    assert "1 rows inside episodes have a successor that is not the next row's state, first at row 59" in said(
+        dataset, episode_starts=starts
+    )
+
+
+def test_constant_dimensions_and_rewards():
+    dataset = walker_dataset()
+    observations, actions = dataset.observations.copy(), dataset.actions.copy()
+    observations[:, [2, 5]], actions[:, 1] = 3.0, 0.0
+    text = said(
+        dataset, observations=observations, next_observations=observations, actions=actions, rewards=np.ones(240)
+    )
+    assert "note: 2 of 11 dimensions of 'observations' are constant (2, 5)" in text
+    assert "warning: 1 of 3 dimensions of 'actions' are constant (1)" in text
+    assert "every reward is 1" in text
+
+
+def test_huge_values():
+    dataset = walker_dataset()
+    observations = dataset.observations.copy()
+    observations[7, 4] = -3e38
+    text = said(dataset, observations=observations, rewards=1e9 * dataset.rewards)
+    assert "'observations' reach a magnitude of 3e+38 in dimension 4" in text
+    assert "'rewards' reach a magnitude of" in text
+
+
+def test_repeated_rows():
+    dataset = walker_dataset()
+    twice = dataset.select([*range(12), 3, 4])
+    assert "40 of 280 rows repeat the observation and action of another" in said(twice)
+
+
+def test_the_report_shows_facts_and_problems_together(tmp_path: Path):
+    content = columns() | {"metadata": np.zeros(3)}
+    content["observations"][5, 2] = np.nan
+    content["actions"] = content["actions"][:-1]
+    inspection = inspect_file(write(tmp_path / "bad.npz", content))
+    shown = io.StringIO()
+    Console(file=shown, width=160).print(render(inspection))
+    text = shown.getvalue()
+    for part in (
+        "observations       float32  (12, 11)",
+        "not read: metadata",
+        "11 rows",
+        "row 5",
+        "not usable: 2 errors",
+    ):
+        assert part in text
+
+
+def test_check_prints_and_exits_by_what_it_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    save_dataset(walker_dataset(), tmp_path / "good.h5")
+    main(["data", "check", str(tmp_path / "good.h5")])
+    text = capsys.readouterr().out
+    assert "240 transitions in 12 episodes of 20 to 20 steps" in text
+    assert text.splitlines()[-1] == "usable"
+    (tmp_path / "bad.h5").write_bytes(b"no")
+    for arguments in (["bad.h5"], ["none.npz"], ["good.h5", "--task", "ant-medium"]):
+        with pytest.raises(SystemExit) as stop:
+            main(["data", "check", str(tmp_path / arguments[0]), *arguments[1:]])
+        assert stop.value.code == 2
+        assert "not usable: " in capsys.readouterr().out
+
+
+# convert
+
+
+@pytest.mark.parametrize(("first", "second"), [(".h5", ".npz"), (".npz", ".hdf5")])
+def test_convert_there_and_back_is_lossless(tmp_path: Path, first: str, second: str):
+    save_dataset(walker_dataset(), tmp_path / f"a{first}")
+    for source, target in ((f"a{first}", f"b{second}"), (f"b{second}", f"c{first}")):
+        _, findings = convert(str(tmp_path / source), str(tmp_path / target))
+        assert findings == []
+    assert (tmp_path / f"c{first}").read_bytes() == (tmp_path / f"a{first}").read_bytes()
+    assert_equal(load_dataset(tmp_path / f"b{second}"), walker_dataset())
+
+
+def test_convert_says_what_it_changes_and_leaves_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    content = columns() | {"infos/qpos": np.zeros((12, 6)), "rewards": columns()["rewards"].astype(np.float64)}
+    del content["next_observations"]
+    main(["data", "convert", str(write(tmp_path / "in.h5", content)), str(tmp_path / "out.npz")])
+    text = capsys.readouterr().out
+    for part in (
+        "Wrote 9 transitions",
+        "is float64 and becomes float32",
+        "the last row of each of 3 episodes",
+        "infos",
+    ):
+        assert part in text
+
+
+def test_convert_refuses_what_is_there_and_what_it_cannot_read(tmp_path: Path):
+    content = columns()
+    content["rewards"][0] = np.nan
+    bad = write(tmp_path / "in.h5", content)
+    with pytest.raises(UserError, match="lists all that is wrong"):
+        convert(str(bad), str(tmp_path / "out.npz"))
+    with pytest.raises(UserError, match="exists already"):
+        convert(str(bad), str(bad))
+    with pytest.raises(UserError, match="name a dataset"):
+        convert(str(bad), str(tmp_path / "out.csv"))
+    assert [path.name for path in tmp_path.iterdir()] == ["in.h5"]
+
+
+def test_a_converted_file_names_its_task(tmp_path: Path):
+    save_dataset(walker_dataset(), tmp_path / "in.h5")
+    with h5py.File(tmp_path / "in.h5", "a") as file:
+        del file.attrs["task"]
+    convert(str(tmp_path / "in.h5"), str(tmp_path / "out.h5"), task="hopper-medium")
+    assert load_dataset(tmp_path / "out.h5").task == "hopper-medium"
