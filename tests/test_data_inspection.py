@@ -132,6 +132,26 @@ def test_convert_there_and_back_is_lossless(tmp_path: Path, first: str, second: 
     assert_equal(load_dataset(tmp_path / f"b{second}"), walker_dataset())
 
 
+def test_convert_to_minari_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    save_dataset(walker_dataset(), tmp_path / "in.h5")
+    assert convert(str(tmp_path / "in.h5"), "minari:my/walker-v0")[1] == []
+    convert("minari:my/walker-v0", str(tmp_path / "out.h5"))
+    assert (tmp_path / "out.h5").read_bytes() == (tmp_path / "in.h5").read_bytes()
+
+
+def test_convert_counts_the_episodes_that_minari_cannot_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    dataset, findings = convert(str(write(tmp_path / "in.h5", columns())), "minari:noise-v0")
+    said = "; ".join(map(str, findings))
+    assert "9 episodes were split" in said
+    assert "no task is named" in said
+    again, _ = convert("minari:noise-v0", str(tmp_path / "out.npz"))
+    assert len(again.episode_starts) == 12
+    for name in ("observations", "actions", "rewards", "next_observations", "terminated"):
+        assert np.array_equal(getattr(again, name), getattr(dataset, name))
+
+
 def test_convert_says_what_it_changes_and_leaves_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     content = columns() | {"infos/qpos": np.zeros((12, 6)), "rewards": columns()["rewards"].astype(np.float64)}
     del content["next_observations"]

@@ -146,9 +146,9 @@ def test_a_dataset_that_exists_is_left_alone() -> None:
 def test_endings_come_from_the_flags_or_the_end_of_the_episode(root: Path) -> None:
     write_raw(root, [episode(3, terminated=True), episode(2, truncated=True), episode(2), episode(1, start=90)])
     dataset = read_minari("raw-v0")
-    assert dataset.episode_starts.tolist() == [0, 3, 5]  # the lone step went
-    assert dataset.terminated.tolist() == [False, False, True, False, False, False, False]
-    assert dataset.truncated.tolist() == [False, False, False, False, True, False, True]
+    assert dataset.episode_starts.tolist() == [0, 3, 5, 7]
+    assert np.flatnonzero(dataset.terminated).tolist() == [2]
+    assert np.flatnonzero(dataset.truncated).tolist() == [4, 6, 7]
     assert dataset.next_observations[2].tolist() == [6.0, 7.0]  # the last observation, not the next episode's first
     assert dataset.action_high.tolist() == [2.0]
 

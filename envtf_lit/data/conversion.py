@@ -4,18 +4,22 @@ from pathlib import Path
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import is_hdf5, open_raw, save_dataset
+from envtf_lit.data.minari_sets import read_minari, write_minari
 from envtf_lit.data.validation import Finding, examine
 from envtf_lit.errors import UserError
+
+MINARI = "minari:"
 
 
 def convert(source: str, target: str, *, task: str | None = None) -> tuple[OfflineDataset, list[Finding]]:
     """Reads a dataset and writes it as something else.
 
-    HDF5 and NPZ hold the same columns, bit for bit, so that nothing is lost between them.
+    HDF5 and NPZ hold the same columns, bit for bit. Minari keeps T+1 observations of an episode of T steps: where a
+    next observation differs from the following row's, `write_minari` splits the episode.
 
     Args:
-        source: an HDF5 or NPZ file.
-        target: a new file ending in .h5, .hdf5 or .npz.
+        source: an HDF5 or NPZ file, or `minari:` and the id of a Minari dataset on this machine.
+        target: a new file ending in .h5, .hdf5 or .npz, or `minari:` and a new id, such as `minari:my/robot-v0`.
         task: such as `hopper-medium-replay`; None takes the name in the source, where there is one.
 
     Returns:
@@ -24,15 +28,27 @@ def convert(source: str, target: str, *, task: str | None = None) -> tuple[Offli
     Raises:
         UserError: the source cannot be used, or the target exists or cannot be written. Nothing half-written stays.
     """
-    is_hdf5(Path(target))
-    if Path(target).exists():
-        raise UserError(f"{target} exists already: give the new file another name, or delete this one.")
+    to_minari = target.startswith(MINARI)
+    if not to_minari:
+        is_hdf5(Path(target))
+        if Path(target).exists():
+            raise UserError(f"{target} exists already: give the new file another name, or delete this one.")
     dataset, findings = _read(source, task)
-    save_dataset(dataset, target)
+    if not to_minari:
+        save_dataset(dataset, target)
+        return dataset, findings
+    splits = write_minari(dataset, target.removeprefix(MINARI))
+    if splits:
+        what = f"{splits} episodes were split where a next observation is not the following row's: Minari keeps one"
+        findings.append(Finding("note", what))
+    if dataset.task is None:
+        findings.append(Finding("note", "no task is named, so that recover_environment() has nothing to make"))
     return dataset, findings
 
 
 def _read(source: str, task: str | None) -> tuple[OfflineDataset, list[Finding]]:
+    if source.startswith(MINARI):
+        return read_minari(source.removeprefix(MINARI), task=task), []
     with open_raw(source) as raw:
         dataset, findings = examine(raw.columns, raw.attributes, task=task, broken=raw.broken)
     if dataset is None:

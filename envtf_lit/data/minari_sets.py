@@ -17,7 +17,7 @@ import gymnasium as gym
 import h5py
 import numpy as np
 
-from envtf_lit.data.dataset import OfflineDataset, without_lone_rows
+from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.validation import build_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.storage import replacing
@@ -35,7 +35,7 @@ def read_minari(id_or_path: str | Path, *, task: str | None = None, download: bo
     """Reads and checks a Minari dataset.
 
     Minari keeps T+1 observations an episode, so that next observations are known to the last row. An episode that ends
-    without a flag is marked truncated; one of a single step is left out. The action space is the dataset's own.
+    without a flag is marked truncated. The action space is the dataset's own.
 
     Args:
         id_or_path: such as `mujoco/hopper/medium-v0`, below `MINARI_DATASETS_PATH` or `~/.minari/datasets`; or the
@@ -52,7 +52,7 @@ def read_minari(id_or_path: str | Path, *, task: str | None = None, download: bo
     with _explained(source):
         dataset = _open(folder, source)
         _check_spaces(dataset, source)
-        columns, _ = without_lone_rows(_columns(dataset, source))
+        columns = _columns(dataset, source)
         attributes = {"action_low": dataset.action_space.low, "action_high": dataset.action_space.high}
         attributes["task"] = dataset.storage.metadata.get(TASK)
     return build_dataset(columns, attributes, task=task, source=source)

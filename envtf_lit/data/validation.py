@@ -198,7 +198,7 @@ def _sound(part: np.ndarray, dtype: type) -> np.ndarray:
     if dtype is bool:
         return (part == 0) | (part == 1)
     if dtype is np.int64:
-        return np.logical_and(np.abs(part) < 2**53, part == np.round(part))
+        return np.less(np.abs(part), 2**53) & np.equal(part, np.round(part))
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite
         return np.isfinite(part.astype(np.float32, copy=False)).reshape(len(part), -1).all(axis=1)
 
