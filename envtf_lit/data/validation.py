@@ -196,7 +196,7 @@ def _one_line(error: Exception) -> str:
 def _sound(part: np.ndarray, dtype: type) -> np.ndarray:
     """(n,) whether each row can be stored as that type: finite in float32, 0 or 1, a whole number."""
     if dtype is bool:
-        return (part == 0) | (part == 1)
+        return np.isin(part, (0, 1))
     if dtype is np.int64:
         return np.less(np.abs(part), 2**53) & np.equal(part, np.round(part))
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite
