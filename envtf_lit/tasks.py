@@ -1,13 +1,18 @@
 """Robots and the twenty tasks: environment ids, termination rules, reference scores."""
 
+import re
+import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from envtf_lit.errors import UserError, did_you_mean
+
+if TYPE_CHECKING:
+    import gymnasium
 
 TIERS = ("random", "medium", "medium-replay", "medium-expert", "full-replay")
 
@@ -50,6 +55,9 @@ class Robot:
 
     `return_random` and `return_expert` are D4RL's reference returns, measured on the older -v2 environments; scores on
     -v5 are therefore comparable among themselves, not with D4RL's tables.
+
+    `variant` is empty for the robot as the twenty tasks have it, else the suffix of its tasks' names: `-v4` for
+    Gymnasium's older simulation, `-105d` for Ant with the contact forces among its observations.
     """
 
     name: str
@@ -62,6 +70,17 @@ class Robot:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     action_limit: float = 1.0  # actions lie in [-limit, limit]
     max_episode_steps: int = 1000
+    variant: str = ""
+
+    def make(self) -> "gymnasium.Env":
+        """The simulator, without Gymnasium's checks of our use of it and its advice to leave -v4, which we asked for."""
+        import gymnasium
+
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
+            return gymnasium.make(
+                self.env_id, max_episode_steps=self.max_episode_steps, disable_env_checker=True, **self.env_kwargs
+            )
 
     def normalised_score(self, episode_return: float) -> float:
         """D4RL's score: 0 is a random policy, 100 its expert. `100 (G - G_random) / (G_expert - G_random)`."""
@@ -89,18 +108,43 @@ class Task:
 
     @property
     def name(self) -> str:
-        return f"{self.robot.name}-{self.tier}"
+        return f"{self.robot.name}-{self.tier}{self.robot.variant}"
 
 
 TASKS = {task.name: task for task in (Task(robot, tier) for robot in ROBOTS.values() for tier in TIERS)}
 
 
+VARIANTS = re.compile(r"(?P<task>.+?)(?P<variant>-v4|-105d)")
+
+
 def get_task(name: str) -> Task:
-    """The task of that name.
+    """The task of that name; `-v4` and `-105d` after one of the twenty names ask for its robot's variants.
 
     Raises:
-        UserError: the name is none of the twenty; the message holds the nearest one.
+        UserError: there is no such task; the message holds the nearest one.
     """
-    if name not in TASKS:
+    task = find_task(name)
+    if task is None:
         raise UserError(f"Unknown task {name!r}: {did_you_mean(name, TASKS)}")
-    return TASKS[name]
+    return task
+
+
+def find_task(name: str) -> Task | None:
+    """The task of that name or None."""
+    match = VARIANTS.fullmatch(name)
+    if match is None or match["task"] not in TASKS:
+        return TASKS.get(name)
+    task = TASKS[match["task"]]
+    if match["variant"] == "-v4":
+        return replace(task, robot=_gymnasium_v4(task.robot))
+    return replace(task, robot=_with_contact_forces(task.robot)) if task.robot.name == "ant" else None
+
+
+def _gymnasium_v4(robot: Robot) -> Robot:
+    """The simulation that is nearest to the one D4RL's v2 files were made in; -v4's Ant has the 27 dimensions alone."""
+    return replace(robot, env_id=robot.env_id.replace("-v5", "-v4"), env_kwargs={}, variant="-v4")
+
+
+def _with_contact_forces(robot: Robot) -> Robot:
+    """Ant as -v5 makes it by default: 78 contact forces and torques follow the 27 dimensions."""
+    return replace(robot, observation_dim=105, env_kwargs={}, variant="-105d")

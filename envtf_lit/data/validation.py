@@ -9,7 +9,7 @@ import numpy as np
 
 from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
 from envtf_lit.errors import UserError
-from envtf_lit.tasks import TASKS, Task, get_task
+from envtf_lit.tasks import Task, find_task, get_task
 
 RANKS = {
     "observations": 2,
@@ -215,7 +215,7 @@ def _unsound(name: str, bad: int, first: int, value: np.ndarray) -> Finding:
 def _find_task(asked: str | None, stored: Any, findings: list[Finding]) -> Task | None:
     """The task asked for, else the one named in the file if it is one of ours."""
     name = stored.decode(errors="replace") if isinstance(stored, bytes) else str(stored)
-    known = TASKS.get(name)
+    known = find_task(name)
     if asked is None:
         return known
     task = get_task(asked)

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import gymnasium
 import numpy as np
 import torch
 from rich.progress import Progress
@@ -91,9 +90,7 @@ class _Lane:
     def __init__(self, robot: Robot, seed: int) -> None:
         # The plain environment, not gymnasium's vector of them: that one restarts (or refuses to step on) copies whose
         # episode is over, and steps all until the longest is done. Here a finished copy costs nothing more.
-        self.env = gymnasium.make(
-            robot.env_id, max_episode_steps=robot.max_episode_steps, disable_env_checker=True, **robot.env_kwargs
-        )
+        self.env = robot.make()
         self.seed, self.running = seed, True
         observation, _ = self.env.reset(seed=seed)
         self.observations, self.positions = [observation.astype(np.float32)], [self._qpos()]
