@@ -11,13 +11,16 @@ class DownloadOptions:
     """Where the dataset comes from.
 
     Attributes:
-        source: `zoo` lets the shipped behaviour policies act in MuJoCo; `file` reads a file of yours.
-        path: the HDF5 or NPZ file of `source: file`.
+        source: `zoo` lets the shipped behaviour policies act in MuJoCo; `file` reads a file of yours; `d4rl` and
+            `minari` fetch those collections' datasets, or read a copy.
+        path: the HDF5 or NPZ file of `source: file`; of `source: d4rl` a copy of its file, null downloads it.
+        minari_id: of `source: minari`, such as `mujoco/hopper/medium-v0`, or its folder.
         transitions: rows to collect from the zoo.
     """
 
-    source: Literal["zoo", "file"] = "zoo"
+    source: Literal["zoo", "file", "d4rl", "minari"] = "zoo"
     path: str | None = None
+    minari_id: str | None = None
     transitions: int = 100_000
 
 

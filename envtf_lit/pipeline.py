@@ -32,11 +32,11 @@ def download(params: Params, root: Path = Path("."), *, progress: bool = True) -
     from envtf_lit.data.sources import dataset_card, make_dataset
 
     with _stage("download", params, root):
-        dataset = make_dataset(
+        dataset, origin = make_dataset(
             get_task(params.task), params.download, seed=params.seed, workers=params.threads, progress=progress
         )
         save_dataset(dataset, root / DATASET)
-        card = dataset_card(dataset, params.download, params.seed)
+        card = dataset_card(dataset, params.download.source, origin)
         write_json(root / CARD, card)
     return card
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.params import ModelOptions, Params, PolicyOptions, TrainModelOptions
+from envtf_lit.params import DownloadOptions, ModelOptions, Params, PolicyOptions, TrainModelOptions
 
 
 class Range(NamedTuple):
@@ -122,19 +122,31 @@ def check_rules(params: Params) -> None:
     from envtf_lit.tasks import get_task  # late: brings in torch
 
     get_task(params.task)
-    _check_download(params)
+    check_download(params.download)
     _check_model(params.train_model.model)
     _check_epochs("train_model", params.train_model)
     _check_policies(params)
     _check_history("generate_rollouts", params.generate_rollouts.history, params.train_model.model)
 
 
-def _check_download(params: Params) -> None:
-    source, path = params.download.source, params.download.path
-    if source == "file" and path is None:
-        raise UserError("download.source is 'file' and download.path is null: give the path of your HDF5 or NPZ file.")
-    if source != "file" and path is not None:
-        raise UserError(f"download.path is {path!r} and download.source is {source!r}: set download.source to 'file'.")
+def check_download(options: DownloadOptions) -> None:
+    """What the source needs is there, and what it has no use for is not.
+
+    Raises:
+        UserError: an option is missing or not wanted.
+    """
+    for name, needed, wanted, what in (
+        ("path", ("file",), ("file", "d4rl"), "the path of your HDF5 or NPZ file"),
+        ("minari_id", ("minari",), ("minari",), "the dataset's id, such as mujoco/hopper/medium-v0"),
+    ):
+        value, source = getattr(options, name), options.source
+        if value is None and source in needed:
+            raise UserError(f"download.source is {source!r} and download.{name} is null: give {what}.")
+        if value is not None and source not in wanted:
+            raise UserError(
+                f"download.{name} is {value!r} and download.source is {source!r}, which has no use for it: set "
+                f"download.source to {wanted[0]!r}, or download.{name} to null."
+            )
 
 
 def _check_model(model: ModelOptions) -> None:

@@ -1,7 +1,9 @@
 """One door for every source, and the card beside the data."""
 
+import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from envtf_lit.data.behaviour import collect
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import save_dataset
+from envtf_lit.data.minari_sets import write_minari
 from envtf_lit.data.sources import dataset_card, make_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.params import DownloadOptions
@@ -19,32 +22,51 @@ ZOO = DownloadOptions(source="zoo", transitions=300)
 
 
 @pytest.fixture(scope="module")
-def dataset() -> OfflineDataset:
-    return make_dataset(TASK, ZOO, seed=0, workers=1)
+def zoo() -> tuple[OfflineDataset, dict[str, Any]]:
+    return make_dataset(TASK, ZOO, seed=7, workers=1)
+
+
+@pytest.fixture(scope="module")
+def dataset(zoo: tuple[OfflineDataset, dict[str, Any]]) -> OfflineDataset:
+    return zoo[0]
 
 
 def test_zoo_is_what_collect_gives(dataset: OfflineDataset):
-    same = collect(TASK, 300, seed=0, workers=1, progress=False)
+    same = collect(TASK, 300, seed=7, workers=1, progress=False)
     assert np.array_equal(dataset.observations, same.observations)
     assert np.array_equal(dataset.actions, same.actions)
 
 
 def test_file(dataset: OfflineDataset, tmp_path: Path):
-    save_dataset(dataset, tmp_path / "log.npz")
-    options = DownloadOptions(source="file", path=str(tmp_path / "log.npz"))
-    read = make_dataset(TASK, options, seed=0, workers=1)
+    path = tmp_path / "log.npz"
+    save_dataset(dataset, path)
+    read, origin = make_dataset(TASK, DownloadOptions(source="file", path=str(path)), seed=0, workers=1)
     assert np.array_equal(read.rewards, dataset.rewards)
-    card = dataset_card(read, options, 0)
-    assert card["path"] == options.path
-    assert "policies" not in card
+    assert origin == {
+        "path": str(path), "bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()
+    }  # fmt: skip
+    assert "policies" not in dataset_card(read, "file", origin)
+
+
+def test_minari(dataset: OfflineDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    write_minari(dataset, "ours/hopper-v0")
+    options = DownloadOptions(source="minari", minari_id="ours/hopper-v0")
+    read, origin = make_dataset(TASK, options, seed=0, workers=1)
+    assert np.array_equal(read.next_observations, dataset.next_observations)
+    card = dataset_card(read, "minari", origin)
+    assert json.loads(json.dumps(card, allow_nan=False)) == card
+    assert (card["minari_id"], card["collected_in"], card["env_id"]) == ("ours/hopper-v0", "Hopper-v5", "Hopper-v5")
+    assert "scores" not in card and "no D4RL-normalised score" in card["note"]
+    assert card["returns"]["max"] == dataset.episode_returns.max()
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (DownloadOptions(source="file"), "download.path is empty"),
+        (DownloadOptions(source="file"), "download.path is null"),
         (DownloadOptions(source="file", path="nowhere.h5"), "nowhere.h5 is not a file"),
-        (DownloadOptions(source="zoo", path="some.h5"), "which reads no file"),
+        (DownloadOptions(source="zoo", path="some.h5"), "has no use for it"),
     ],
 )
 def test_options_that_contradict_each_other(options: DownloadOptions, message: str):
@@ -52,8 +74,8 @@ def test_options_that_contradict_each_other(options: DownloadOptions, message: s
         make_dataset(TASK, options, seed=0, workers=1)
 
 
-def test_card_of_the_zoo(dataset: OfflineDataset):
-    card = dataset_card(dataset, ZOO, 7)
+def test_card_of_the_zoo(zoo: tuple[OfflineDataset, dict[str, Any]]):
+    dataset, card = zoo[0], dataset_card(zoo[0], "zoo", zoo[1])
     assert json.loads(json.dumps(card, allow_nan=False)) == card
     assert card["transitions"] == sum(policy["transitions"] for policy in card["policies"]) == 300
     assert card["episodes"] == card["terminated"] + card["truncated"] == len(dataset.episode_starts)

@@ -77,7 +77,6 @@ def lost_experiment(tmp_path_factory) -> Path:
     from envtf_lit.evaluation.returns import Episode, Returns
     from envtf_lit.figures import gallery
     from envtf_lit.figures.video import write_gif
-    from envtf_lit.params import DownloadOptions
     from envtf_lit.storage import write_json
     from envtf_lit.tasks import ROBOTS
     from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
@@ -108,7 +107,7 @@ def lost_experiment(tmp_path_factory) -> Path:
         world_model=world_model_metrics(report, scale, parameters=12), baselines={k: returns[k] for k in ("bc", "cql")},
     )  # fmt: skip
     write_json(root / "reports/metrics.json", metrics)
-    write_json(root / "data/dataset.json", dataset_card(data, DownloadOptions(source="file", path="my.h5"), 3))
+    write_json(root / "data/dataset.json", dataset_card(data, "file", {"path": "my.h5"}))
     return root
 
 

@@ -122,13 +122,3 @@ class OfflineDataset:
 def starts_from_ends(ends: np.ndarray) -> np.ndarray:
     """(E,) episode starts from an (N,) boolean column that marks each episode's last row; the last row always ends."""
     return np.concatenate([[0], np.flatnonzero(ends[:-1]) + 1]).astype(np.int64)
-
-
-def without_lone_rows(columns: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:
-    """Columns without the episodes of a single row, which hold no sequence, and how many they were."""
-    ended = columns["terminated"] | columns["truncated"]
-    starts = starts_from_ends(ended)
-    lone = starts[np.diff(starts, append=len(ended)) == 1]
-    if not len(lone):
-        return columns, 0
-    return {name: np.delete(values, lone, axis=0) for name, values in columns.items()}, len(lone)

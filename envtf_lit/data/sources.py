@@ -2,59 +2,83 @@
 
 import platform
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from envtf_lit.data.behaviour import collect, plan
+from envtf_lit.data.d4rl import load_d4rl
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.fetch import sha256
 from envtf_lit.data.formats import load_dataset
-from envtf_lit.errors import UserError
+from envtf_lit.data.minari_sets import describe_minari, read_minari
 from envtf_lit.params import DownloadOptions
 from envtf_lit.tasks import Task, get_task
+from envtf_lit.validation import check_download
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+MINARI_NOTE = (
+    "Minari's datasets come from its own policies and are not D4RL's files: returns compare with those of policies in "
+    "the same environment, and get no D4RL-normalised score here."
+)
+D4RL_NOTE = "Scores are D4RL's own: returns of its files, by its references."
 
 
 def make_dataset(
     task: Task, options: DownloadOptions, *, seed: int, workers: int, progress: bool = True
-) -> OfflineDataset:
-    """The task's dataset from `options.source`.
+) -> tuple[OfflineDataset, dict[str, Any]]:
+    """The task's dataset from `options.source`. Nothing else in the package reads the network.
 
     Args:
-        task: robot and tier; of a file, only the robot must fit.
+        task: robot and tier; of a file or a Minari dataset, only the robot must fit.
         options: the source, and what it needs.
-        seed: of the zoo's environments and actions; a file has no use for it.
+        seed: of the zoo's environments and actions; the others have no use for it.
         workers: processes that collect; they do not change the result.
         progress: shows a bar with the time left.
 
+    Returns:
+        The dataset, and where it comes from: policies, URL or id, size and sum of the file; ready for JSON.
+
     Raises:
-        UserError: the zoo lacks the task, `options.path` is missing or not wanted, or the file is bad.
+        UserError: the zoo lacks the task, a path or id is missing or not wanted, a download fails, or the data are bad.
     """
-    if options.source == "file":
-        if options.path is None:
-            raise UserError("download.source is file and download.path is empty: name the HDF5 or NPZ file there.")
-        return load_dataset(options.path, task=task.name)
-    if options.path is not None:
-        raise UserError(
-            f"download.path is {options.path} and download.source is zoo, which reads no file: set the source to file, "
-            "or the path to null."
-        )
-    return collect(task, options.transitions, seed=seed, workers=workers, progress=progress)
+    check_download(options)
+    match options.source:
+        case "zoo":
+            dataset = collect(task, options.transitions, seed=seed, workers=workers, progress=progress)
+            return dataset, _zoo_origin(task, options.transitions, seed)
+        case "d4rl":
+            dataset, origin = load_d4rl(task, options.path, progress=progress)
+            return dataset, origin | {"note": D4RL_NOTE}
+        case "minari":
+            assert options.minari_id is not None
+            dataset = read_minari(options.minari_id, task=task.name, download=True)
+            return dataset, describe_minari(options.minari_id) | {"note": MINARI_NOTE}
+        case "file":
+            assert options.path is not None
+            path = Path(options.path)
+            dataset = load_dataset(path, task=task.name)
+            return dataset, {"path": options.path, "bytes": path.stat().st_size, "sha256": sha256(path)}
 
 
-def dataset_card(dataset: OfflineDataset, options: DownloadOptions, seed: int) -> dict[str, Any]:
+def dataset_card(dataset: OfflineDataset, source: str, origin: dict[str, Any]) -> dict[str, Any]:
     """What a dataset holds and how it came about, ready for JSON.
+
+    Args:
+        dataset: all of it.
+        source: as in `DownloadOptions`.
+        origin: what `make_dataset` says of it.
 
     Returns:
         task, source, transitions, episodes, terminated and truncated episodes, steps per episode, the distribution of
-        episode returns, D4RL-normalised scores where the robot is known, and for the zoo its policies, environment,
-        seed and package versions.
+        episode returns, D4RL-normalised scores where the robot is known (and the source is not Minari, whose sets have
+        no such scores), the environment that scores policies, and the origin.
     """
     lengths = dataset.episode_lengths
     card: dict[str, Any] = {
         "task": dataset.task,
-        "source": options.source,
+        "source": source,
         "transitions": len(dataset),
         "episodes": len(lengths),
         "terminated": int(dataset.terminated.sum()),
@@ -63,15 +87,12 @@ def dataset_card(dataset: OfflineDataset, options: DownloadOptions, seed: int) -
         "returns": _distribution(dataset.episode_returns),
     }
     if dataset.task is not None:
-        task = get_task(dataset.task)
-        mean, best = dataset.episode_returns.mean(), dataset.episode_returns.max()
-        card["scores"] = {name: task.robot.normalised_score(float(x)) for name, x in (("mean", mean), ("max", best))}
-        card["env_id"] = task.robot.env_id
-        if options.source == "zoo":
-            card |= _provenance(task, options.transitions, seed)
-    if options.source == "file":
-        card["path"] = options.path
-    return card
+        robot = get_task(dataset.task).robot
+        card["env_id"] = robot.env_id
+        if source != "minari":
+            mean, best = float(dataset.episode_returns.mean()), float(dataset.episode_returns.max())
+            card["scores"] = {"mean": robot.normalised_score(mean), "max": robot.normalised_score(best)}
+    return card | origin
 
 
 def _distribution(values: np.ndarray) -> dict[str, float]:
@@ -85,7 +106,7 @@ def _distribution(values: np.ndarray) -> dict[str, float]:
     }
 
 
-def _provenance(task: Task, transitions: int, seed: int) -> dict[str, Any]:
+def _zoo_origin(task: Task, transitions: int, seed: int) -> dict[str, Any]:
     policies = [
         {
             "policy": f"snapshot after {phase.steps} steps" if phase.steps else "uniform random (warm-up)",
