@@ -1,6 +1,8 @@
 """Minari's own library reads what we write, and we read what it writes."""
 
+import contextlib
 import json
+import shutil
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -12,6 +14,8 @@ import huggingface_hub.constants
 import minari
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from minari.data_collector.episode_buffer import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
@@ -220,6 +224,8 @@ def damage(data: Path, how: str) -> None:
             del group["rewards"]
             if how == "external link":
                 group["rewards"] = h5py.ExternalLink("/etc/passwd", "/x")
+            elif how == "absurd size":
+                group.create_dataset("rewards", (10**14,), np.float32, chunks=(10**6,), compression="gzip")
             elif how == "short rewards":
                 group["rewards"] = np.ones(1)
             elif how == "texts":
@@ -236,7 +242,8 @@ def damage(data: Path, how: str) -> None:
         ("other version", "9.9.9"),
         ("no spaces", "does not say its spaces"),
         ("no rewards", "damaged"),
-        ("external link", "link under /episode_1/rewards"),
+        ("external link", "under /episode_1/rewards what leads elsewhere"),
+        ("absurd size", "fills the memory"),
         ("short rewards", "T steps need"),
         ("texts", "damaged"),
     ],
@@ -246,6 +253,41 @@ def test_damaged_sets_are_refused_with_a_sentence(root: Path, how: str, message:
     damage(root / "plain-v0/data", how)
     with pytest.raises(UserError, match=message):
         read_minari("plain-v0")
+
+
+ODD = st.one_of(
+    st.none(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=9),
+    st.lists(st.integers(), max_size=2),
+    st.sampled_from(
+        ['{"type": "Box"}', '{"type": "Box", "shape": [9e9], "dtype": "f4", "low": 0, "high": 1}', "arrow"]
+    ),
+)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_whatever_is_damaged_ends_in_a_dataset_or_a_sentence(tmp_path: Path, data: st.DataObject) -> None:
+    folder = tmp_path / "minari/plain-v0/data"
+    if not folder.exists():
+        write_minari(make_dataset("ant-random", 27, 8), "plain-v0")
+        for name in ("main_data.hdf5", "metadata.json"):
+            shutil.copy(folder / name, tmp_path / name)
+    content = bytearray((tmp_path / "main_data.hdf5").read_bytes())
+    metadata = json.loads((tmp_path / "metadata.json").read_text())
+    if data.draw(st.booleans()):
+        for place, byte in data.draw(st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)))):
+            content[place] = byte
+        del content[data.draw(st.integers(len(content) // 2, len(content))) :]
+    else:
+        metadata[data.draw(st.sampled_from(sorted(metadata)))] = data.draw(ODD)
+    (folder / "main_data.hdf5").write_bytes(content)
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    for read in (read_minari, describe_minari):
+        with contextlib.suppress(UserError):
+            read("plain-v0")
 
 
 # remote

@@ -154,8 +154,12 @@ def _find_names(present: Iterable[str]) -> tuple[dict[str, str], list[str]]:
     return found, [name for name in there if name not in found.values() and name not in ATTRIBUTES]
 
 
-def _check_size(raw: Raw, path: Path, declared: dict[str, int]) -> None:
-    """Refuses sizes (bytes of each column) that make a small file a large one."""
+def check_size(path: Path, declared: dict[str, int]) -> None:
+    """Refuses sizes (bytes of each array) that make a small file a large one.
+
+    Raises:
+        UserError: the file declares hundreds of times what it holds.
+    """
     total, stored = sum(declared.values()), path.stat().st_size
     if total > BOMB_BYTES and total > BOMB_RATIO * stored:
         name = max(declared, key=lambda key: declared[key])
@@ -180,7 +184,7 @@ def _open_hdf5(path: Path) -> tuple[h5py.File, Raw]:
                 raw.broken[column] = Finding("error", what, "store one, without links, objects or foreign filters")
             else:
                 raw.columns[column] = item
-        _check_size(raw, path, {name: _hdf5_bytes(item) for name, item in raw.columns.items()})
+        check_size(path, {name: hdf5_bytes(item) for name, item in raw.columns.items()})
         for name in ATTRIBUTES:
             if name in file.attrs:
                 raw.attributes[name] = _hdf5_attribute(file, name)
@@ -190,19 +194,27 @@ def _open_hdf5(path: Path) -> tuple[h5py.File, Raw]:
     return file, raw
 
 
-def _plain_hdf5(file: h5py.File, name: str) -> h5py.Dataset | None:
-    """A plain array of this very file: nothing that leads to another file, no objects, no code of plugins."""
-    item = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
-    if not isinstance(item, h5py.Dataset) or item.shape is None or item.dtype.kind not in "biuf":
+def own_hdf5(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
+    """What lies in this very file under that name; None for what leads to another, or to the code of plugins."""
+    item = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
+    if isinstance(item, h5py.Group):
+        return item
+    if not isinstance(item, h5py.Dataset):
         return None
     plan = item.id.get_create_plist()
     filters = {plan.get_filter(index)[0] for index in range(plan.get_nfilters())}
     return None if item.external or item.is_virtual or filters - HDF5_FILTERS else item
 
 
-def _hdf5_bytes(item: h5py.Dataset) -> int:
+def hdf5_bytes(item: h5py.Dataset) -> int:
     """What reading takes: all of it, and at least one chunk."""
-    return item.dtype.itemsize * max(math.prod(item.shape), math.prod(item.chunks or ()))
+    return item.dtype.itemsize * max(math.prod(item.shape or ()), math.prod(item.chunks or ()))
+
+
+def _plain_hdf5(file: h5py.File, name: str) -> h5py.Dataset | None:
+    """A plain array of numbers."""
+    item = own_hdf5(file, name)
+    return item if isinstance(item, h5py.Dataset) and item.shape is not None and item.dtype.kind in "biuf" else None
 
 
 def _hdf5_attribute(file: h5py.File, name: str) -> Any:
@@ -226,7 +238,7 @@ def _open_npz(path: Path) -> tuple[zipfile.ZipFile, Raw]:
         members = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
         names, raw.ignored = _find_names(members)
         declared = {name: archive.getinfo(members[name]).file_size for name in names.values()}
-        _check_size(raw, path, declared)
+        check_size(path, declared)
         for column, name in names.items():
             _read_member(raw, archive, members[name], column)
         for name in ATTRIBUTES:

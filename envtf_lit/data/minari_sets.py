@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.formats import check_size, hdf5_bytes, own_hdf5
 from envtf_lit.data.validation import build_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.storage import replacing
@@ -177,7 +178,16 @@ def _explained(source: str) -> Iterator[None]:
         raise
     except ImportError as error:
         raise UserError(f"{source} needs a package that is missing ({error}).") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError, RuntimeError) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        AssertionError,
+        RuntimeError,
+        MemoryError,
+    ) as error:
         raise UserError(f"{source} is damaged or too new or old ({_line(error)}): fetch or write it anew.") from None
 
 
@@ -198,23 +208,30 @@ def _open(folder: Path, source: str) -> "MinariDataset":
         # minari would import the code that the metadata name, to ask it for its spaces
         raise UserError(f"{source} does not say its spaces: write it anew with Minari 0.5 or newer.")
     if metadata.get("data_format") == "hdf5":
-        _refuse_links(folder / HDF5_FILE, source)
+        _check_file(folder / HDF5_FILE, source)
     return MinariDataset(folder)
 
 
-def _refuse_links(path: Path, source: str) -> None:
-    """Nothing that leads to another file."""
+def _check_file(path: Path, source: str) -> None:
+    """Nothing that leads to another file, and no sizes that the file cannot hold."""
+    declared = {}
 
-    def check(group: h5py.Group) -> None:
-        for name in group:
-            item = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
+    def visit(group: h5py.Group) -> None:
+        for name in map(str, group):
+            item = own_hdf5(group, name)
+            if item is None:
+                where = f"{group.name}/{name}".replace("//", "/")
+                raise UserError(
+                    f"{source} holds under {where} what leads elsewhere: store plain arrays, without links."
+                )
             if isinstance(item, h5py.Group):
-                check(item)
-            elif not isinstance(item, h5py.Dataset) or item.external or item.is_virtual:
-                raise UserError(f"{source} holds a link under {group.name}/{name}: store plain arrays, without links.")
+                visit(item)
+            else:
+                declared[f"{group.name}/{name}"] = hdf5_bytes(item)
 
     with h5py.File(path, "r") as file:
-        check(file)
+        visit(file)
+    check_size(path, declared)
 
 
 def _check_spaces(dataset: "MinariDataset", source: str) -> None:
