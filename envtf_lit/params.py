@@ -234,7 +234,7 @@ class Params:
     """All of `params.yaml`.
 
     Attributes:
-        task: robot and tier, such as `hopper-medium-replay`.
+        task: robot and tier, such as `hopper-medium-replay`, or null for a robot of your own.
         seed: of everything random.
         threads: CPU threads of each stage; part of what makes results equal to the bit.
         precision: of matrix products in training and imagination; losses and optimisers stay in fp32.
@@ -245,7 +245,7 @@ class Params:
         evaluate: the evidence.
     """
 
-    task: str = "hopper-medium-replay"
+    task: str | None = "hopper-medium-replay"
     seed: int = 0
     threads: int = 2
     precision: Precision = "bf16"

@@ -6,7 +6,7 @@ Each reads what the stages before it wrote below `root`, writes its own outputs 
 import contextlib
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import torch
 
 from envtf_lit.params import Params, PolicyOptions
 from envtf_lit.storage import pick_device, read_json, replacing, write_json
-from envtf_lit.tasks import Robot, get_task
+from envtf_lit.tasks import Robot, get_task, never_terminated
 
 DATASET, CARD = Path("data/dataset.h5"), Path("data/dataset.json")
 WORLD_MODEL, BEHAVIOUR = Path("models/world_model"), Path("models/behaviour")
@@ -33,7 +33,11 @@ def download(params: Params, root: Path = Path("."), *, progress: bool = True) -
 
     with _stage("download", params, root):
         dataset, origin = make_dataset(
-            get_task(params.task), params.download, seed=params.seed, workers=params.threads, progress=progress
+            None if params.task is None else get_task(params.task),
+            params.download,
+            seed=params.seed,
+            workers=params.threads,
+            progress=progress,
         )
         save_dataset(dataset, root / DATASET)
         card = dataset_card(dataset, params.download.source, origin)
@@ -95,11 +99,17 @@ def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool 
 
     options = params.generate_rollouts
     with _stage("generate_rollouts", params, root):
-        key = _key(params, asdict(options))
+        key = _key(params, asdict(options)) | _unseen(params)
         dataset = load_dataset(root / DATASET)
         run = run_folder(root, "generate_rollouts", key, [root / DATASET])
         clone, curves = clone_behaviour(
-            root / DATASET, options, seed=params.seed, run=run, precision=params.precision, progress=progress
+            root / DATASET,
+            options,
+            seed=params.seed,
+            run=run,
+            precision=params.precision,
+            progress=progress,
+            **_unseen(params),
         )
         with replacing(root / BEHAVIOUR) as folder:
             save_policy(folder, clone)
@@ -115,7 +125,7 @@ def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool 
                 NoisyPolicy(clone.to(device), options.exploration),
                 starts,
                 horizon=options.horizon,
-                terminated=_robot(params).terminated,
+                terminated=_termination(params),
                 mode=options.mode,
                 generator=generator,
             )
@@ -149,6 +159,7 @@ def train_policy(
             discount=options.discount,
             n_step=options.n_step,
             return_temperature=options.return_temperature,
+            **_unseen(params),
             seed=params.seed,
         )
         agent = CQL(
@@ -164,7 +175,7 @@ def train_policy(
             _give_imagination(agent, params, root, data.dataset)
             inputs += [root / WORLD_MODEL, root / ROLLOUTS]
             monitor = "val/imagined_return" if options.imagination.selection_episodes > 0 else None
-        key = _key(params, asdict(options))
+        key = _key(params, asdict(options)) | _unseen(params)
         curves = fit(
             agent,
             data,
@@ -186,14 +197,19 @@ def train_policy(
 
 
 def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
-    """Scores policies in MuJoCo and the model on held-out episodes: `reports/metrics.json`, `plots/`, `video/`."""
+    """Scores policies and the model: `reports/metrics.json`, `plots/`, `video/`.
+
+    The model is scored on held-out episodes, policies in MuJoCo. For a robot without a simulator (`task: null`) there
+    are no scores: what the model promises the policies, and how they agree with held-out actions, is all.
+    """
     import pandas as pd
 
     from envtf_lit.data.formats import load_dataset
-    from envtf_lit.evaluation.evidence import collect_metrics, world_model_metrics
+    from envtf_lit.evaluation.evidence import collect_metrics, collect_promises, world_model_metrics
+    from envtf_lit.evaluation.offline import judge
     from envtf_lit.evaluation.returns import evaluate_policy
     from envtf_lit.figures import gallery
-    from envtf_lit.figures.video import real_vs_imagined
+    from envtf_lit.figures.video import no_video, real_vs_imagined
     from envtf_lit.imagination import load_rollouts
     from envtf_lit.policy import load_policy
     from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
@@ -205,42 +221,36 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         model = load_world_model(root / WORLD_MODEL)
         training, held_out = dataset.split(params.train_model.held_out, seed=params.seed)
         scale = Scale.of(training)
-        trajectories = whole_episodes(held_out, options.trajectories, seed=params.seed)
-        report = horizon_report(model, trajectories, scale)
+        report = horizon_report(model, whole_episodes(held_out, options.trajectories, seed=params.seed), scale)
         folders = {"bc": BEHAVIOUR, **{name: POLICIES / name for name in ALGORITHMS}}
-        returns = {
-            name: evaluate_policy(
-                load_policy(root / folder), robot, episodes=options.episodes, seed=params.seed, progress=progress
-            )
-            for name, folder in folders.items()
-        }
-        metrics = collect_metrics(
-            task=params.task,
+        policies = {name: load_policy(root / folder) for name, folder in folders.items()}
+        curves = {name: pd.read_csv(root / POLICIES / name / "curves.csv") for name in ALGORITHMS}
+        facts: dict[str, Any] = dict(
             seed=params.seed,
             dataset=dataset,
-            robot=robot,
             world_model=world_model_metrics(report, scale, parameters=sum(p.numel() for p in model.parameters())),
             rollouts=len(rollouts),
-            policy=returns["et_cql"],
-            baselines={name: returns[name] for name in ("bc", "cql")},
         )
-        curves = {name: pd.read_csv(root / POLICIES / name / "curves.csv") for name in ALGORITHMS}
-        with replacing(root / PLOTS) as plots:
+        with replacing(root / PLOTS) as plots, replacing(root / VIDEO) as video:
             plots.mkdir()
+            video.mkdir()
             gallery.draw_dataset(dataset, plots)
             gallery.draw_world_model(report, scale, robot, pd.read_csv(root / WORLD_MODEL / "curves.csv"), plots)
             gallery.draw_rollouts(rollouts.step.numpy(), rollouts.uncertainty.numpy(), plots)
-            gallery.draw_policies(dataset, robot, returns, curves, plots)
-        with replacing(root / VIDEO) as video:
-            video.mkdir()
-            real_vs_imagined(
-                model,
-                returns["et_cql"].median,
-                robot,
-                scale,
-                video / "real_vs_imagined.gif",
-                frames=options.video_frames,
-            )
+            if robot is None:
+                promises = judge(model, policies, report, training)
+                metrics = collect_promises(promises, **facts)
+                gallery.draw_promises(promises, curves, plots)
+                no_video(video)
+            else:
+                returns = {
+                    name: evaluate_policy(policy, robot, episodes=options.episodes, seed=params.seed, progress=progress)
+                    for name, policy in policies.items()
+                }
+                metrics = collect_metrics(returns, task=str(params.task), robot=robot, **facts)
+                gallery.draw_policies(dataset, robot, returns, curves, plots)
+                episode, gif = returns["et_cql"].median, video / "real_vs_imagined.gif"
+                real_vs_imagined(model, episode, robot, scale, gif, frames=options.video_frames)
         write_json(root / METRICS, metrics)
     return metrics
 
@@ -270,12 +280,23 @@ def _give_imagination(agent: Any, params: Params, root: Path, dataset: Any) -> N
     model = load_world_model(root / WORLD_MODEL).to(device)
     temperature = agent.options.return_temperature
     weights = None if temperature is None else return_weights(dataset, temperature)  # as the real rows are drawn
-    imagination = Imagination(model, dataset, _robot(params).terminated, agent.options.imagination, device, weights)
+    imagination = Imagination(model, dataset, _termination(params), agent.options.imagination, device, weights)
     agent.dream_with(imagination, load_rollouts(root / ROLLOUTS), reward_std=float(dataset.rewards.std()))
 
 
-def _robot(params: Params) -> Robot:
-    return get_task(params.task).robot
+def _robot(params: Params) -> Robot | None:
+    return None if params.task is None else get_task(params.task).robot
+
+
+def _termination(params: Params) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The robot's rule; where none is known, imagined rollouts end at their horizon alone."""
+    robot = _robot(params)
+    return never_terminated if robot is None else robot.terminated
+
+
+def _unseen(params: Params) -> dict[str, float]:
+    """What policies must not see: where no simulator can score them, held-out actions have to."""
+    return {"held_out": params.train_model.held_out} if params.task is None else {}
 
 
 def _key(params: Params, options: dict[str, Any]) -> dict[str, Any]:

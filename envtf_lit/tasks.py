@@ -45,7 +45,7 @@ def ant_terminated(observation: Tensor) -> Tensor:
 
 
 def never_terminated(observation: Tensor) -> Tensor:
-    """HalfCheetah-v5 has no unhealthy state: episodes end by the time limit alone."""
+    """HalfCheetah-v5 has no unhealthy state, and of a robot that is none of ours no rule is known."""
     return torch.zeros(observation.shape[:-1], dtype=torch.bool, device=observation.device)
 
 

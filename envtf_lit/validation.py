@@ -121,20 +121,26 @@ def check_rules(params: Params) -> None:
     """
     from envtf_lit.tasks import get_task  # late: brings in torch
 
-    get_task(params.task)
-    check_download(params.download)
+    if params.task is not None:
+        get_task(params.task)
+    check_download(params.download, named=params.task is not None)
     _check_model(params.train_model.model)
     _check_epochs("train_model", params.train_model)
     _check_policies(params)
     _check_history("generate_rollouts", params.generate_rollouts.history, params.train_model.model)
 
 
-def check_download(options: DownloadOptions) -> None:
-    """What the source needs is there, and what it has no use for is not.
+def check_download(options: DownloadOptions, *, named: bool) -> None:
+    """What the source needs is there, and what it has no use for is not; `named` is whether there is a task.
 
     Raises:
         UserError: an option is missing or not wanted.
     """
+    if not named and options.source in ("zoo", "d4rl"):
+        raise UserError(
+            f"task is null and download.source is {options.source!r}, which has our robots' data alone: name one of the "
+            "tasks, or set download.source to 'file'."
+        )
     for name, needed, wanted, what in (
         ("path", ("file",), ("file", "d4rl"), "the path of your HDF5 or NPZ file"),
         ("minari_id", ("minari",), ("minari",), "the dataset's id, such as mujoco/hopper/medium-v0"),

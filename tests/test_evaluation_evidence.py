@@ -23,14 +23,13 @@ def metrics() -> dict:
     data, scale = linear_data((20, 30, 25), noise=0.05), Scale.of(linear_data((20, 30, 25), noise=0.05))
     report = horizon_report(linear_world(std=0.05), whole_episodes(data, 3, seed=0), scale)
     return collect_metrics(
+        {"bc": returns([50.0]), "cql": returns([10.0, 20.0, 30.0]), "et_cql": returns([100.0, 300.0])},
         task="hopper-medium-replay",
         seed=7,
         dataset=data,
         robot=ROBOTS["hopper"],
         world_model=world_model_metrics(report, scale, parameters=123),
         rollouts=456,
-        policy=returns([100.0, 300.0]),
-        baselines={"bc": returns([50.0]), "cql": returns([10.0, 20.0, 30.0])},
     )
 
 

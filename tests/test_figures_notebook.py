@@ -103,8 +103,8 @@ def lost_experiment(tmp_path_factory) -> Path:
     gallery.draw_policies(data, hopper, returns, {"cql": policy_curves, "et_cql": policy_curves}, plots)
     write_gif([Image.new("RGB", (8, 8))], root / "reports/video/real_vs_imagined.gif")
     metrics = collect_metrics(
-        task="hopper-medium-replay", seed=3, dataset=data, robot=hopper, rollouts=9, policy=returns["et_cql"],
-        world_model=world_model_metrics(report, scale, parameters=12), baselines={k: returns[k] for k in ("bc", "cql")},
+        returns, task="hopper-medium-replay", seed=3, dataset=data, robot=hopper, rollouts=9,
+        world_model=world_model_metrics(report, scale, parameters=12),
     )  # fmt: skip
     write_json(root / "reports/metrics.json", metrics)
     write_json(root / "data/dataset.json", dataset_card(data, "file", {"path": "my.h5"}))

@@ -40,11 +40,22 @@ class BehaviourClone(L.LightningModule):
 
 
 def clone_behaviour(
-    path: Path, options: GenerateRolloutsOptions, *, seed: int, run: Path, precision: Precision, progress: bool
+    path: Path,
+    options: GenerateRolloutsOptions,
+    *,
+    seed: int,
+    run: Path,
+    precision: Precision,
+    progress: bool,
+    held_out: float = 0.0,
 ) -> tuple[TanhGaussianActor, Curves]:
-    """Fits a clone to the dataset at `path`; `run` holds its resumable checkpoints meanwhile."""
+    """Fits a clone to the dataset at `path`, less a share held out; `run` holds resumable checkpoints meanwhile."""
     data = TransitionData(
-        str(path), batch_size=options.clone_batch_size, steps_per_epoch=CLONE_STEPS_PER_EPOCH, seed=seed
+        str(path),
+        batch_size=options.clone_batch_size,
+        steps_per_epoch=CLONE_STEPS_PER_EPOCH,
+        held_out=held_out,
+        seed=seed,
     )
     actor = TanhGaussianActor(
         data.observation_dim,

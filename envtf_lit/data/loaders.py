@@ -205,7 +205,8 @@ class TransitionData(L.LightningDataModule):
         discount: of future rewards, per step.
         n_step: steps whose rewards enter the temporal-difference target.
         return_temperature: of `return_weights`; None draws rows uniformly.
-        seed: of all draws.
+        held_out: share of the episodes left out, the ones that `WindowData` holds out with the same share and seed.
+        seed: of the split and of all draws.
     """
 
     def __init__(
@@ -217,13 +218,15 @@ class TransitionData(L.LightningDataModule):
         discount: float = 0.99,
         n_step: int = 1,
         return_temperature: float | None = None,
+        held_out: float = 0.0,
         seed: int = 0,
     ) -> None:
         super().__init__()
         self.batch_size, self.updates_per_step, self.steps_per_epoch = batch_size, updates_per_step, steps_per_epoch
         self.discount, self.n_step, self.seed = discount, n_step, seed
         self.return_temperature = return_temperature
-        self.dataset = load_dataset(path)
+        whole = load_dataset(path)
+        self.dataset = whole.split(held_out, seed=seed)[0] if held_out > 0 else whole
         self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
         self.action_low, self.action_high = self.dataset.action_low.tolist(), self.dataset.action_high.tolist()
 

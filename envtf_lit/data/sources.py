@@ -1,6 +1,7 @@
 """Where datasets come from, and the card that says what one holds."""
 
 import platform
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,12 +27,13 @@ D4RL_NOTE = "Scores are D4RL's own: returns of its files, by its references."
 
 
 def make_dataset(
-    task: Task, options: DownloadOptions, *, seed: int, workers: int, progress: bool = True
+    task: Task | None, options: DownloadOptions, *, seed: int, workers: int, progress: bool = True
 ) -> tuple[OfflineDataset, dict[str, Any]]:
     """The task's dataset from `options.source`. Nothing else in the package reads the network.
 
     Args:
         task: robot and tier; of a file or a Minari dataset, only the robot must fit.
+            None is a robot of the user's own, of which a file or Minari has data.
         options: the source, and what it needs.
         seed: of the zoo's environments and actions; the others have no use for it.
         workers: processes that collect; they do not change the result.
@@ -43,23 +45,31 @@ def make_dataset(
     Raises:
         UserError: the zoo lacks the task, a path or id is missing or not wanted, a download fails, or the data are bad.
     """
-    check_download(options)
+    check_download(options, named=task is not None)
+    name = None if task is None else task.name
     match options.source:
         case "zoo":
+            assert task is not None
             dataset = collect(task, options.transitions, seed=seed, workers=workers, progress=progress)
             return dataset, _zoo_origin(task, options.transitions, seed)
         case "d4rl":
+            assert task is not None
             dataset, origin = load_d4rl(task, options.path, progress=progress)
             return dataset, origin | {"note": D4RL_NOTE}
         case "minari":
             assert options.minari_id is not None
-            dataset = read_minari(options.minari_id, task=task.name, download=True)
-            return dataset, describe_minari(options.minari_id) | {"note": MINARI_NOTE}
+            dataset = read_minari(options.minari_id, task=name, download=True)
+            return _renamed(dataset, name), describe_minari(options.minari_id) | {"note": MINARI_NOTE}
         case "file":
             assert options.path is not None
             path = Path(options.path)
-            dataset = load_dataset(path, task=task.name)
-            return dataset, {"path": options.path, "bytes": path.stat().st_size, "sha256": sha256(path)}
+            dataset = load_dataset(path, task=name)
+            return _renamed(dataset, name), {"path": options.path, "bytes": path.stat().st_size, "sha256": sha256(path)}
+
+
+def _renamed(dataset: OfflineDataset, name: str | None) -> OfflineDataset:
+    """Whatever a file calls its task, a user who names none wants none."""
+    return replace(dataset, task=name)
 
 
 def dataset_card(dataset: OfflineDataset, source: str, origin: dict[str, Any]) -> dict[str, Any]:

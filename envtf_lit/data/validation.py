@@ -198,9 +198,10 @@ def _sound(part: np.ndarray, dtype: type) -> np.ndarray:
     if dtype is bool:
         return np.isin(part, (0, 1))
     if dtype is np.int64:
-        return np.less(np.abs(part), 2**53) & np.equal(part, np.round(part))
+        exact = part.astype(np.float64)
+        return np.less(np.abs(exact), 2**53) & np.equal(exact, np.round(exact))
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite
-        return np.isfinite(part.astype(np.float32, copy=False)).reshape(len(part), -1).all(axis=1)
+        return np.atleast_1d(np.isfinite(part.astype(np.float32, copy=False)).reshape(len(part), -1).all(axis=1))
 
 
 def _unsound(name: str, bad: int, first: int, value: np.ndarray) -> Finding:

@@ -7,6 +7,7 @@ import numpy as np
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.calibration import coverage
+from envtf_lit.evaluation.offline import Promises
 from envtf_lit.evaluation.returns import Returns
 from envtf_lit.tasks import Robot
 from envtf_lit.world_models.horizon import HorizonReport, Scale
@@ -37,6 +38,7 @@ def world_model_metrics(report: HorizonReport, scale: Scale, *, parameters: int)
 
 
 def collect_metrics(
+    returns: Mapping[str, Returns],
     *,
     task: str,
     seed: int,
@@ -44,22 +46,19 @@ def collect_metrics(
     robot: Robot,
     world_model: Mapping[str, Any],
     rollouts: int,
-    policy: Returns,
-    baselines: Mapping[str, Returns],
 ) -> dict[str, Any]:
     """What `reports/metrics.json` holds; standard deviations are over episodes, with n in the denominator.
 
     Args:
+        returns: episodes of `bc`, `cql` and `et_cql`.
         task: name of the task.
         seed: of the experiment.
         dataset: the whole of it, held-out episodes included.
         robot: gives the scores their scale.
         world_model: of `world_model_metrics`.
         rollouts: imagined transitions stored by `generate_rollouts`.
-        policy: episodes of `et_cql`.
-        baselines: episodes of `bc` and `cql`.
     """
-    recorded = dataset_scores(dataset, robot)
+    recorded, policy = dataset_scores(dataset, robot), returns["et_cql"]
     return {
         "task": task,
         "seed": seed,
@@ -77,9 +76,51 @@ def collect_metrics(
             "return_std": float(policy.returns.std()),
             "episodes": len(policy.returns),
         },
-        "baselines": {name: _score(returns) for name, returns in baselines.items()},
+        "baselines": {name: _score(found) for name, found in returns.items() if name != "et_cql"},
     }
 
 
 def _score(returns: Returns) -> dict[str, float]:
     return {"score_mean": float(returns.scores.mean()), "score_std": float(returns.scores.std())}
+
+
+def collect_promises(
+    promises: Promises, *, seed: int, dataset: OfflineDataset, world_model: Mapping[str, Any], rollouts: int
+) -> dict[str, Any]:
+    """What `reports/metrics.json` holds for a robot without a simulator: no score, and no return that anyone measured.
+
+    Args:
+        promises: of `bc`, `cql` and `et_cql`.
+        seed: of the experiment.
+        dataset: the whole of it, held-out episodes included.
+        world_model: of `world_model_metrics`.
+        rollouts: imagined transitions stored by `generate_rollouts`.
+    """
+    policies = {
+        name: {
+            "imagined_return_mean": float(promise.returns.mean()),
+            "imagined_return_std": float(promise.returns.std()),
+            "action_error": promise.action_error,
+        }
+        for name, promise in promises.policies.items()
+    }
+    return {
+        "task": None,
+        "seed": seed,
+        "dataset": {
+            "transitions": len(dataset),
+            "episodes": len(dataset.episode_starts),
+            "return_mean": float(dataset.episode_returns.mean()),
+            "return_max": float(dataset.episode_returns.max()),
+        },
+        "world_model": dict(world_model),
+        "rollouts": {"transitions": rollouts},
+        "held_out": {
+            "episodes": len(promises.recorded),
+            "return_mean": float(promises.recorded.mean()),
+            "imagined_return_mean": float(promises.promised.mean()),
+            "imagined_return_error": float(np.sqrt(np.square(promises.promised - promises.recorded).mean())),
+        },
+        "policy": policies.pop("et_cql"),
+        "baselines": policies,
+    }

@@ -8,6 +8,7 @@ import pandas as pd
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.evidence import dataset_scores
+from envtf_lit.evaluation.offline import Promises
 from envtf_lit.evaluation.returns import Returns
 from envtf_lit.figures import learning, model, scores
 from envtf_lit.figures.style import write_table
@@ -20,15 +21,18 @@ def draw_dataset(dataset: OfflineDataset, folder: Path) -> None:
     scores.returns_histogram(dataset.episode_returns, dataset.episode_lengths, folder / "dataset_returns.png")
 
 
-def draw_world_model(report: HorizonReport, scale: Scale, robot: Robot, curves: pd.DataFrame, folder: Path) -> None:
+def draw_world_model(
+    report: HorizonReport, scale: Scale, robot: Robot | None, curves: pd.DataFrame, folder: Path
+) -> None:
     """`world_model_curves`, `horizon`, `one_step`, `calibration`, `traces`, and the table `horizon_steps.csv`."""
+    name = robot.name if robot else None
     learning.learning_curves(
         {"world_model": curves}, folder / "world_model_curves.png", title="World model, in training"
     )
     model.horizon_errors(report, folder / "horizon.png")
-    model.one_step_predictions(report, robot.name, folder / "one_step.png")
-    model.calibration_curve(report, scale, robot.name, folder / "calibration.png")
-    model.traces(report, robot.name, folder / "traces.png")
+    model.one_step_predictions(report, name, folder / "one_step.png")
+    model.calibration_curve(report, scale, name, folder / "calibration.png")
+    model.traces(report, name, folder / "traces.png")
     write_table(folder / "horizon_steps.csv", model.horizon_table(report))
 
 
@@ -55,4 +59,19 @@ def draw_policies(
     """
     by_policy = {name: result.scores for name, result in returns.items()}
     scores.score_strip({"data": dataset_scores(dataset, robot)} | by_policy, folder / "scores.png")
+    learning.learning_curves(curves, folder / "policy_curves.png", title="Policies, in training")
+
+
+def draw_promises(promises: Promises, curves: Mapping[str, pd.DataFrame], folder: Path) -> None:
+    """`scores`, here of imagined returns, and `policy_curves`, for a robot without a simulator.
+
+    Args:
+        promises: of `bc`, `cql` and `et_cql`.
+        curves: the curves.csv of `cql` and `et_cql`.
+        folder: to write into.
+    """
+    known = {"recorded": promises.recorded, "promised": promises.promised}
+    returns = known | {name: promise.returns for name, promise in promises.policies.items()}
+    title = "Recorded returns, and returns in imagination alone"
+    scores.score_strip(returns, folder / "scores.png", quantity="return", title=title)
     learning.learning_curves(curves, folder / "policy_curves.png", title="Policies, in training")

@@ -12,12 +12,20 @@ from envtf_lit.figures.style import COLOURS, LABELS, drawing, write_table
 GOLDEN = 0.618033988749895
 
 
-def score_strip(scores: Mapping[str, np.ndarray], path: str | Path) -> Path:
-    """Every episode's D4RL-normalised score as a dot, with mean and standard deviation.
+def score_strip(
+    scores: Mapping[str, np.ndarray],
+    path: str | Path,
+    *,
+    quantity: str = "normalised score\n(0 random, 100 D4RL's expert)",
+    title: str = "Score of every episode",
+) -> Path:
+    """Every episode's score as a dot, with mean and standard deviation.
 
     Args:
         scores: `data`, `bc`, `cql`, `et_cql` (or any names) to the scores (E,) of their episodes.
         path: PNG to write; the numbers go beside it as CSV.
+        quantity: what a score is, with its unit.
+        title: over all of them.
     """
     with drawing(path, (1.9 * len(scores) + 1.2, 4.6)) as (_, axes):
         axis = axes[0, 0]
@@ -34,8 +42,8 @@ def score_strip(scores: Mapping[str, np.ndarray], path: str | Path) -> Path:
         axis.set_xticks(range(len(scores)), [LABELS.get(name, name) for name in scores])
         axis.set_xlim(-0.5, len(scores) - 0.4)
         axis.grid(visible=False, axis="x")
-        axis.set_ylabel("normalised score\n(0 random, 100 D4RL's expert)")
-        axis.set_title("Score of every episode, with mean ± standard deviation", pad=22)
+        axis.set_ylabel(quantity)
+        axis.set_title(f"{title}, with mean ± standard deviation", pad=22)
     parts = [pd.DataFrame({"policy": name, "episode": range(len(v)), "score": v}) for name, v in scores.items()]
     write_table(path, pd.concat(parts))
     return Path(path)

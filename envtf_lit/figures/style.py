@@ -21,6 +21,7 @@ COLOURS = {
     "cql": "#0072B2",
     "et_cql": "#009E73",
     "recorded": "#333333",
+    "promised": "#D55E00",
     "imagined": "#D55E00",
     "taught": "#56B4E9",
     "threshold": "#999999",
@@ -31,6 +32,8 @@ LABELS = {
     "cql": "CQL on data",
     "et_cql": "CQL on data\nand imagination",
     "world_model": "world model",
+    "recorded": "recorded\n(held out)",
+    "promised": "model, on the\nrecorded actions",
 }
 JOINTS = {
     "hopper": ("thigh", "leg", "foot"),

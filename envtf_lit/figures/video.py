@@ -66,6 +66,12 @@ def real_vs_imagined(
     return backend
 
 
+def no_video(folder: Path) -> None:
+    """Says in `none.txt` why there is no GIF: the pipeline's output must hold something, and only what is true."""
+    reason = "No video: this robot has no simulator here that could be shown beside the imagination.\n"
+    (folder / "none.txt").write_text(reason)
+
+
 def _imagine(model: WorldModel, episode: Episode, scale: Scale, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """States (steps + 1, S), the first one real, and the open-loop nmse (steps + 1,) of each."""
     observations = torch.from_numpy(episode.observations[: steps + 1])

@@ -1,0 +1,104 @@
+"""What can be said of a policy without its environment: what the model promises it, and how far it agrees with the log.
+
+An imagined return is the world model's opinion. It is printed beside what the same model says of the recorded actions,
+whose true return the log knows: that difference is how wrong the opinion can be.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.imagination import imagine
+from envtf_lit.policy import Policy
+from envtf_lit.tasks import never_terminated
+from envtf_lit.world_models.horizon import HorizonReport, Trajectories
+from envtf_lit.world_models.interface import WorldModel
+
+LIVE = 1e-6  # an action dimension that varies less has no choice to agree about
+
+
+@dataclass(frozen=True, eq=False)
+class Promise:
+    """What is known of one policy without its environment.
+
+    Attributes:
+        returns: (E,) float64, imagined return from the first state of each held-out episode, over as many steps as
+            the recorded episode lasted.
+        action_error: mean over steps and live dimensions of (deterministic action - recorded action)^2 / variance of
+            the dimension in training; 1 is as good as the mean action.
+    """
+
+    returns: np.ndarray
+    action_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Promises:
+    """What is known of policies without their environment.
+
+    Attributes:
+        recorded: (E,) float64, true returns of the held-out episodes.
+        promised: (E,) float64, what the model, on its own predictions, makes of the same actions.
+        policies: by name.
+    """
+
+    recorded: np.ndarray
+    promised: np.ndarray
+    policies: dict[str, Promise]
+
+
+def judge(
+    model: WorldModel, policies: Mapping[str, Policy], report: HorizonReport, training: OfflineDataset
+) -> Promises:
+    """The policies in the world model, and beside the log.
+
+    Args:
+        model: in eval mode, on the device of the report's trajectories.
+        policies: by name; none may have learned from the held-out episodes.
+        report: of the model on whole held-out episodes.
+        training: gives the range of rewards and the spread of actions.
+    """
+    held_out = report.trajectories
+    promised = (_bounded(report.imagined.mean[..., -1], training) * held_out.valid).sum(1)
+    return Promises(
+        recorded=held_out.targets[..., -1].double().sum(1).cpu().numpy(),
+        promised=promised.cpu().numpy(),
+        policies={
+            name: Promise(imagined_returns(model, policy, held_out, training), action_error(policy, held_out, training))
+            for name, policy in policies.items()
+        },
+    )
+
+
+@torch.no_grad()
+def imagined_returns(model: WorldModel, policy: Policy, held_out: Trajectories, training: OfflineDataset) -> np.ndarray:
+    """(E,) returns of mean predictions under deterministic actions; no rule ends an episode before its recorded end.
+
+    Rewards are cut to the range of the training data's, so that a model that runs away promises no more than was ever
+    paid.
+    """
+    B, steps = held_out.actions.shape[:2]
+    no_actions = held_out.actions[:, :0]
+    starts = held_out.observations[:, :1], no_actions, torch.ones_like(held_out.lengths)
+    imagined = imagine(model, policy, starts, horizon=0, tail=steps, terminated=never_terminated, mode="mean")
+    counts = imagined.step < held_out.lengths[imagined.branch]
+    rewards = torch.where(counts, _bounded(imagined.rewards, training), 0.0)
+    return torch.zeros(B, dtype=torch.float64).index_add_(0, imagined.branch.cpu(), rewards.cpu()).numpy()
+
+
+def _bounded(rewards: Tensor, training: OfflineDataset) -> Tensor:
+    low, high = float(training.rewards.min()), float(training.rewards.max())
+    return rewards.double().nan_to_num(nan=low).clamp(low, high)
+
+
+def action_error(policy: Policy, held_out: Trajectories, training: OfflineDataset) -> float:
+    """See `Promise.action_error`; zero where no action dimension varies."""
+    spread = torch.as_tensor(np.asarray(training.actions).std(axis=0, dtype=np.float64))
+    live = spread > LIVE
+    chosen = policy.act(held_out.observations[held_out.valid], True).cpu().double()
+    error = (chosen - held_out.actions[held_out.valid].cpu().double())[:, live] / spread[live]
+    return float(error.square().mean()) if bool(live.any()) else 0.0
