@@ -138,8 +138,8 @@ def check_download(options: DownloadOptions, *, named: bool) -> None:
     """
     if not named and options.source in ("zoo", "d4rl"):
         raise UserError(
-            f"task is null and download.source is {options.source!r}, which has our robots' data alone: name one of the "
-            "tasks, or set download.source to 'file'."
+            f"task is null and download.source is {options.source!r}, which has our robots' data alone: name one "
+            "of the tasks, or set download.source to 'file'."
         )
     for name, needed, wanted, what in (
         ("path", ("file",), ("file", "d4rl"), "the path of your HDF5 or NPZ file"),
