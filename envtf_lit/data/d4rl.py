@@ -96,9 +96,9 @@ def read_d4rl(path: str | Path, task: Task) -> tuple[OfflineDataset, dict[str, i
 
     Next observations are those of the file, at terminals and timeouts too: `d4rl.qlearning_dataset` takes the
     following row instead, at an episode's end another's first. Where the file has none, they come from the following
-    row of the same episode, whose last row is left out. An episode that stops without a flag (in the replays of a learner
-    whose budget ended) is marked truncated there. Ant's constant zeros go, and velocities lie in [-10, 10] where the
-    simulator shows no others.
+    row of the same episode, whose last row is left out. An episode that stops without a flag (in the replays of a
+    learner whose budget ended) is marked truncated there. Ant's constant zeros go, and velocities lie in [-10, 10]
+    where the simulator shows no others.
 
     Args:
         path: an HDF5 file.
