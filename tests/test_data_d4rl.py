@@ -102,6 +102,12 @@ def test_a_download_is_kept_and_found_again(folder: Path, web: Server) -> None:
     assert (origin["bytes"], origin["sha256"]) == FILES["hopper-medium"]
 
 
+@pytest.mark.usefixtures("folder", "web")
+def test_the_published_file_has_d4rls_scores() -> None:
+    _, origin = make_dataset(HOPPER, DownloadOptions(source="d4rl"), seed=0, workers=1, progress=False)
+    assert "Scores are D4RL's own" in origin["note"]
+
+
 def test_a_server_that_refuses_says_where_to_place_a_copy(folder: Path, web: Server) -> None:
     web.statuses = [403]
     with pytest.raises(UserError) as error:
@@ -132,7 +138,7 @@ def test_a_copy_and_its_card(tmp_path: Path) -> None:
     assert (card["task"], card["env_id"], card["source"]) == ("hopper-medium-v4", "Hopper-v4", "d4rl")
     assert card["url"].endswith("gym_mujoco_v2/hopper_medium-v2.hdf5")
     assert card["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert card["published_file"] is False
+    assert card["published_file"] is False and "not the file that D4RL publishes" in card["note"]
     assert card["scores"]["max"] == pytest.approx(100 * (dataset.episode_returns.max() + 20.272305) / 3254.572305)
     assert card["mended"] == {"constant_dimensions": 0, "clipped_velocities": 0, "unmarked_ends": 0}
 
@@ -252,6 +258,14 @@ def test_odd_shapes_are_refused(tmp_path: Path, name: str, shape: tuple[int, ...
 def test_another_robots_file(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="111 observation and 8 action dimensions"):
         read_d4rl(write(tmp_path / "a.hdf5", ant_log()), HOPPER)
+
+
+def test_a_dataset_of_ours_for_another_simulator(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.hdf5", log())
+    with h5py.File(path, "a") as file:
+        file.attrs["task"] = "hopper-medium"
+    with pytest.raises(UserError, match="made for hopper-medium, not for hopper-medium-v4"):
+        read_d4rl(path, HOPPER)
 
 
 def test_half_a_file(tmp_path: Path) -> None:

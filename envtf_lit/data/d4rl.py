@@ -118,7 +118,7 @@ def read_d4rl(path: str | Path, task: Task) -> tuple[OfflineDataset, dict[str, i
         columns = {name: _flat(name, np.asarray(values)) for name, values in columns.items()}
         mended["clipped_velocities"] = _clip_velocities(columns, task.robot)
         mended["unmarked_ends"] = _mark_ends(columns)
-        return build_dataset(columns, {}, task=task.name, source=str(path), broken=raw.broken), mended
+        return build_dataset(columns, raw.attributes, task=task.name, source=str(path), broken=raw.broken), mended
 
 
 def _published_copy(remote: RemoteFile, progress: bool) -> Path:

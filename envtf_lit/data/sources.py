@@ -23,7 +23,10 @@ MINARI_NOTE = (
     "Minari's datasets come from its own policies and are not D4RL's files: returns compare with those of policies in "
     "the same environment, and get no D4RL-normalised score here."
 )
-D4RL_NOTE = "Scores are D4RL's own: returns of its files, by its references."
+D4RL_NOTES = {
+    True: "Scores are D4RL's own: returns of its file, by its references.",
+    False: "This is not the file that D4RL publishes (another size or sum): its scores are not those of D4RL's tables.",
+}
 
 
 def make_dataset(
@@ -55,7 +58,7 @@ def make_dataset(
         case "d4rl":
             assert task is not None
             dataset, origin = load_d4rl(task, options.path, progress=progress)
-            return dataset, origin | {"note": D4RL_NOTE}
+            return dataset, origin | {"note": D4RL_NOTES[origin["published_file"]]}
         case "minari":
             assert options.minari_id is not None
             dataset = read_minari(options.minari_id, task=name, download=True)
