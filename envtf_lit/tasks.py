@@ -73,14 +73,20 @@ class Robot:
     variant: str = ""
 
     def make(self) -> "gymnasium.Env":
-        """The simulator, without Gymnasium's checks of our use of it and its advice to leave -v4, which we asked for."""
+        """The simulator, without Gymnasium's checks of our use of it and its advice to leave -v4."""
         import gymnasium
+        import mujoco
 
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
-            return gymnasium.make(
-                self.env_id, max_episode_steps=self.max_episode_steps, disable_env_checker=True, **self.env_kwargs
-            )
+        # HalfCheetah's own model file makes MuJoCo 4 complain at each start, on the screen and in MUJOCO_LOG.TXT
+        mujoco.set_mju_user_warning(lambda message: None)  # pyright: ignore[reportAttributeAccessIssue]
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
+                return gymnasium.make(
+                    self.env_id, max_episode_steps=self.max_episode_steps, disable_env_checker=True, **self.env_kwargs
+                )
+        finally:
+            mujoco.set_mju_user_warning(None)  # pyright: ignore[reportAttributeAccessIssue]
 
     def normalised_score(self, episode_return: float) -> float:
         """D4RL's score: 0 is a random policy, 100 its expert. `100 (G - G_random) / (G_expert - G_random)`."""

@@ -1,5 +1,7 @@
 """The zoo: what is collected is made of true transitions, exactly as planned, whatever the number of processes."""
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,20 +11,23 @@ import torch
 
 from envtf_lit.data.behaviour import (
     ENVIRONMENTS,
-    ZOO_TASKS,
+    UNIT_ROWS,
+    ZOO,
     Phase,
-    Trace,
-    _collect_phase,
-    _cut,
+    _collect_unit,
+    _Log,
+    _units,
     collect,
+    describe_origin,
     load_snapshot,
     plan,
-    read_zoo,
+    read_series,
 )
-from envtf_lit.data.dataset import COLUMNS, OfflineDataset
+from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
 from envtf_lit.data.formats import save_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.tasks import TASKS, get_task
+from envtf_lit.evaluation.returns import evaluate_policy
+from envtf_lit.tasks import ROBOTS, TASKS, TIERS, Robot, get_task
 
 TASK = get_task("hopper-medium-replay")
 ROWS = 2_000
@@ -73,16 +78,33 @@ def test_terminated_is_the_robots_rule_and_the_rest_is_cut(dataset: OfflineDatas
     assert 0 < dataset.truncated.sum() <= 2 * len(plan(TASK, ROWS))  # no episode of these reaches the time limit
 
 
+@pytest.mark.parametrize("name", ["walker2d-random", "halfcheetah-random", "ant-random"])
+def test_rows_of_every_robot_follow_one_another(name: str):
+    """Episodes that end by a fall, by a time limit of 30 steps, and by the cut; no row leads to a reset state."""
+    robot = replace(get_task(name).robot, max_episode_steps=30)
+    columns = _collect_unit(robot, read_series(robot), Phase(0, 400, None), seed=0, index=0)
+    ended = columns["terminated"] | columns["truncated"]
+    assert ended[-1]
+    same = (columns["next_observations"][:-1] == columns["observations"][1:]).all(axis=1)
+    assert np.array_equal(same, ~ended[:-1])
+    fell = robot.terminated(torch.from_numpy(columns["next_observations"])).numpy()
+    assert np.array_equal(fell, columns["terminated"])
+    assert fell.any() == (name != "halfcheetah-random")  # which never falls
+    lengths = np.diff(starts_from_ends(ended), append=400)
+    assert (lengths[~fell[ended]][:-1] == 30).all()
+    velocity = np.abs(columns["next_observations"][ended][:, -robot.action_dim :]).max(axis=1)
+    assert (velocity > 1.0).all()  # of joints in motion; after a reset it is below 0.5
+
+
 def test_the_time_limit_truncates_and_keeps_the_true_final_state():
-    robot = replace(TASK.robot, env_kwargs={"max_episode_steps": 6})
-    episodes = _collect_phase(robot, Phase(0, 100, None), seed=0, index=0)
-    assert [len(episode["rewards"]) for episode in episodes] == [6] * 16 + [4]
-    for episode in episodes:
-        assert episode["truncated"].tolist() == [False] * (len(episode["rewards"]) - 1) + [True]
-        assert not episode["terminated"].any()
-        change = np.abs(episode["next_observations"] - episode["observations"]).max(axis=1)
-        assert change[-1] > 0.1  # random actions kick the joints; a reset state would be still
-        assert np.abs(episode["next_observations"][-1, 5:]).max() > 0.1
+    robot = replace(TASK.robot, max_episode_steps=6)
+    columns = _collect_unit(robot, read_series(robot), Phase(0, 100, None), seed=0, index=0)
+    ends = np.flatnonzero(columns["truncated"])
+    assert ends.tolist() == [*range(5, 96, 6), 99]
+    assert not columns["terminated"].any()
+    change = np.abs(columns["next_observations"] - columns["observations"]).max(axis=1)
+    assert (change[ends] > 0.1).all()  # random actions kick the joints; a reset state would be still
+    assert (np.abs(columns["next_observations"][ends, 5:]).max(axis=1) > 0.1).all()
 
 
 def test_bytes_do_not_depend_on_the_number_of_processes(tmp_path: Path):
@@ -91,63 +113,209 @@ def test_bytes_do_not_depend_on_the_number_of_processes(tmp_path: Path):
     assert (tmp_path / "1.h5").read_bytes() == (tmp_path / "2.h5").read_bytes()
 
 
+def test_a_dataset_of_many_units_does_not_depend_on_their_order(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("envtf_lit.data.behaviour.UNIT_ROWS", 100)
+    task = get_task("hopper-medium-expert")
+    forwards = collect(task, 240, seed=0, workers=1, progress=False)
+    monkeypatch.setattr("envtf_lit.data.behaviour.sorted", lambda jobs, key: list(jobs)[::-1], raising=False)
+    backwards = collect(task, 240, seed=0, workers=1, progress=False)
+    assert all(np.array_equal(getattr(forwards, name), getattr(backwards, name)) for name in COLUMNS)
+    alone = collect(get_task("hopper-medium"), 120, seed=0, workers=1, progress=False)
+    assert np.array_equal(forwards.observations[:120], alone.observations)  # the same policy with the same seeds
+
+
 def test_seed_matters():
-    first, second, again = (_collect_phase(TASK.robot, plan(TASK, 200)[1], seed, index=1) for seed in (0, 1, 0))
-    assert not np.array_equal(first[0]["actions"][:2], second[0]["actions"][:2])
-    assert not np.array_equal(first[0]["observations"][:2], second[0]["observations"][:2])
-    assert all(np.array_equal(first[0][name], again[0][name]) for name in COLUMNS)
+    series = read_series(TASK.robot)
+    unit = plan(TASK, 200)[1]
+    first, second, again = (_collect_unit(TASK.robot, series, unit, seed, index=1) for seed in (0, 1, 0))
+    assert not np.array_equal(first["actions"][:2], second["actions"][:2])
+    assert not np.array_equal(first["observations"][:2], second["observations"][:2])
+    assert all(np.array_equal(first[name], again[name]) for name in COLUMNS)
 
 
-def test_plan_covers_the_learners_life():
+@pytest.mark.slow
+def test_the_pipelines_dataset_is_the_one_that_results_were_published_on(tmp_path: Path):
+    save_dataset(collect(TASK, 100_000, seed=0, workers=2, progress=False), tmp_path / "dataset.h5")
+    found = hashlib.sha256((tmp_path / "dataset.h5").read_bytes()).hexdigest()
+    # on x86-64 with AVX-512, mujoco 4.0.0 and torch 2.13.0; elsewhere sums may round differently
+    assert found == "7296bf05d9cb86b39dd202f941f98cfce2f226d7e73f19fe4ea5a93a9e71db8a"
+
+
+def test_plan_of_a_replay_covers_the_learners_life():
     phases = plan(TASK, 150_000)
     assert [phase.steps for phase in phases] == [0, *range(10_000, 100_001, 10_000), 125_000, 150_000]
     assert [phase.rows for phase in phases] == [5_000, 5_000, *[10_000] * 9, 25_000, 25_000]
-    assert phases[-1].mean_return == min(
-        (phase.mean_return for phase in phases if phase.mean_return), key=lambda value: abs(value - 3220 / 3)
-    )
 
 
-@pytest.mark.parametrize("transitions", [200, 1_234, 100_000])
-def test_plan_adds_up(transitions: int):
-    rows = [phase.rows for phase in plan(TASK, transitions)]
-    assert sum(rows) == transitions
-    assert min(rows) >= 2
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_tiers_are_made_of_the_right_policies(robot: Robot):
+    series = read_series(robot)
+    phases = {tier: plan(get_task(f"{robot.name}-{tier}"), 100_000) for tier in TIERS}
+    best = max(snapshot.mean_return for snapshot in series.snapshots)
+    medium, expert = series.medium, series.expert
+    assert expert.mean_return == best
+    early = [s for s in series.snapshots if s.steps <= expert.steps]
+    assert all(abs(medium.mean_return - best / 3) <= abs(s.mean_return - best / 3) for s in early)
+    assert phases["random"] == [Phase(0, 100_000, None)]
+    assert phases["medium"] == [Phase(medium.steps, 100_000, medium.mean_return)]
+    assert [(phase.steps, phase.rows) for phase in phases["medium-expert"]] == [
+        (medium.steps, 50_000),
+        (expert.steps, 50_000),
+    ]
+    for tier, last in (("medium-replay", medium), ("full-replay", expert)):
+        assert [phase.steps for phase in phases[tier]] == [0, *(s.steps for s in early if s.steps <= last.steps)]
+        ends = np.cumsum([phase.rows for phase in phases[tier]])
+        steps = np.array([series.warm_up_steps, *(phase.steps for phase in phases[tier][1:])])
+        np.testing.assert_allclose(ends / 100_000, steps / last.steps, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", sorted(set(TASKS) - set(ZOO_TASKS)))
-def test_other_tasks_are_refused(name: str):
-    with pytest.raises(UserError, match=f"no snapshots for {name}.*hopper-medium-replay"):
-        collect(get_task(name), ROWS, seed=0, workers=1, progress=False)
+@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("transitions", [1_234, 100_000, 1_000_000])
+def test_plan_adds_up(name: str, transitions: int):
+    phases = plan(TASKS[name], transitions)
+    assert sum(phase.rows for phase in phases) == transitions
+    assert min(phase.rows for phase in phases) >= 2
+    units = [unit for phase in phases for unit in _units(phase)]
+    assert sum(unit.rows for unit in units) == transitions
+    assert {phase.steps for phase in phases} == {unit.steps for unit in units}
+    assert min(unit.rows for unit in units) >= 2
+    assert max(unit.rows for unit in units) <= UNIT_ROWS
+
+
+@pytest.mark.parametrize("rows", [2, 3, UNIT_ROWS, UNIT_ROWS + 1, 2 * UNIT_ROWS + 2])
+def test_units_are_no_episode_of_one_row(rows: int):
+    units = _units(Phase(7, rows, 1.0))
+    assert sum(unit.rows for unit in units) == rows
+    assert min(unit.rows for unit in units) >= 2
 
 
 def test_too_few_transitions_are_refused():
-    with pytest.raises(UserError, match="transitions is 13"):
+    with pytest.raises(UserError, match=r"13 transitions are too few .* ask for \d+ or more"):
         collect(TASK, 13, seed=0, workers=1, progress=False)
 
 
-def test_snapshots_act_and_differ():
-    observation = torch.zeros(ENVIRONMENTS, 11)
-    observation[:, 0] = 1.25
-    actions = [load_snapshot(TASK.robot, s["steps"]).act(observation)[0] for s in read_zoo(TASK.robot)["snapshots"]]
+@pytest.mark.parametrize("name", ["hopper-medium-v4", "ant-medium-v4", "ant-medium-105d", "ant-random-105d"])
+def test_variants_are_driven_by_the_same_policies(name: str):
+    task = get_task(name)
+    dataset = collect(task, 60, seed=0, workers=1, progress=False)
+    assert dataset.task == name
+    assert dataset.observations.shape == dataset.next_observations.shape == (60, task.robot.observation_dim)
+    usual = collect(get_task(f"{task.robot.name}-{task.tier}"), 60, seed=0, workers=1, progress=False)
+    common = usual.observation_dim
+    # the same start and the same first action; what follows differs in -v4 alone
+    same = 60 if name.endswith("105d") else 1
+    np.testing.assert_array_equal(dataset.actions[:same], usual.actions[:same])
+    np.testing.assert_array_equal(dataset.observations[:same, :common], usual.observations[:same])
+    if name.endswith("105d"):
+        assert np.abs(dataset.next_observations[:, 27:]).max() > 0  # contact forces
+
+
+def test_origin_names_every_policy_and_version():
+    origin = describe_origin(get_task("ant-medium-expert"), 1_000, 3)
+    assert [policy["transitions"] for policy in origin["policies"]] == [500, 500]
+    assert origin["policies"][1]["score_deterministic"] > 70
+    assert origin["env_kwargs"] == {"include_cfrc_ext_in_observation": False}
+    assert (origin["env_id"], origin["seed"]) == ("Ant-v5", 3)
+    assert set(origin["versions"]) == {"gymnasium", "mujoco", "numpy", "torch", "python"}
+    assert "not D4RL's files" in origin["note"]
+
+
+# the shipped snapshots
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_snapshots_act_and_differ(robot: Robot):
+    series = read_series(robot)
+    observation, _ = robot.make().reset(seed=0)
+    batch = torch.tensor(observation, dtype=torch.float32).expand(ENVIRONMENTS, -1)
+    actions = [load_snapshot(series, s.steps).act(batch)[0] for s in series.snapshots]
     assert len(torch.unique(torch.stack(actions), dim=0)) == len(actions)
     assert torch.stack(actions).abs().max() <= 1
+    files = {path.stem for path in series.folder.glob("*.safetensors")}
+    assert files == {f"{s.steps:07d}" for s in series.snapshots}
 
 
-def trace(length: int, *, terminated: bool) -> Trace:
-    rows = [(np.zeros(2), np.zeros(1), 1.0, np.zeros(2), terminated and i == length - 1, False) for i in range(length)]
-    return Trace(rows, finished=terminated)
+def test_the_zoo_is_small():
+    assert sum(path.stat().st_size for path in ZOO.rglob("*") if path.is_file()) <= 12_000_000
+
+
+def check_returns(robot: Robot, steps: int, episodes: int) -> None:
+    """Falls make a mean return uncertain, rounding on another machine even more: five standard errors and 5 %."""
+    series = read_series(robot)
+    recorded = next(snapshot for snapshot in series.snapshots if snapshot.steps == steps)
+    found = evaluate_policy(load_snapshot(series, steps), robot, episodes=episodes, seed=0, progress=False)
+    allowed = 5 * recorded.return_std / np.sqrt(episodes) + 0.05 * abs(recorded.mean_return)
+    assert abs(found.returns.mean() - recorded.mean_return) <= allowed
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_experts_return_what_is_recorded(robot: Robot):
+    check_returns(robot, read_series(robot).expert.steps, episodes=2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_all_snapshots_return_what_is_recorded(robot: Robot):
+    for snapshot in read_series(robot).snapshots:
+        check_returns(robot, snapshot.steps, episodes=20)
 
 
 @pytest.mark.parametrize(
-    ("rows", "lengths", "truncated"),
+    ("content", "message"), [(None, "does not exist"), ("{}", "not what `envtf zoo train` writes")]
+)
+def test_a_folder_that_is_no_zoo_is_refused(content: str | None, message: str, tmp_path: Path):
+    if content is not None:
+        (tmp_path / "hopper").mkdir()
+        (tmp_path / "hopper/zoo.json").write_text(content)
+    with pytest.raises(UserError, match=message):
+        read_series(TASK.robot, tmp_path)
+
+
+# the log of many environments
+
+
+def log_of(endings: Sequence[Sequence[str]]) -> _Log:
+    """A log of environments whose steps are given as letters: `.` goes on, `t` terminates, `c` is the time limit."""
+    robot = replace(TASK.robot, observation_dim=1, action_dim=1)
+    log = _Log(robot, len(endings))
+    for step, letters in enumerate(zip(*endings, strict=True)):
+        values = np.arange(len(letters)) + 10.0 * step
+        flags = (np.array([letter == mark for letter in letters]) for mark in "tc")
+        log.append(values[:, None], values[:, None], values, values[:, None] + 10, *flags)
+    return log
+
+
+def test_the_log_keeps_episodes_in_the_order_they_began_and_drops_resets():
+    log = log_of(["..t#...", ".....c#"])  # what stands at # is the automatic reset
+    assert log.usable_rows() == 3 + 6 + 3
+    columns = log.cut(11)
+    assert columns["rewards"].tolist() == [0, 10, 20, 1, 11, 21, 31, 41, 51, 40, 50]
+    assert np.flatnonzero(columns["terminated"]).tolist() == [2]
+    assert np.flatnonzero(columns["truncated"]).tolist() == [8, 10]
+
+
+def test_a_running_episode_closes_the_usable_ones():
+    """Later ones, though finished, would make short episodes too frequent."""
+    log = log_of([".....", ".t#.t"])
+    assert log.usable_rows() == 5
+    assert log.cut(4)["truncated"].tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("rows", "ends"),
     [
-        (5, [5], [False]),  # exactly one whole episode
-        (7, [5, 2], [False, True]),  # the second one is cut
-        (6, [4, 2], [True, True]),  # a lone row is no episode: the first one gives one up
+        (5, [4]),  # exactly one whole episode
+        (7, [4, 6]),  # the second one is cut
+        (6, [3, 5]),  # a lone row is no episode: the first one gives one up
     ],
 )
-def test_cut(rows: int, lengths: list[int], truncated: list[bool]):
-    episodes = _cut([trace(5, terminated=True), trace(4, terminated=False)], rows)
-    assert [len(episode["rewards"]) for episode in episodes] == lengths
-    assert [bool(episode["truncated"][-1]) for episode in episodes] == truncated
-    assert [bool(episode["terminated"][-1]) for episode in episodes] == [not cut for cut in truncated]
+def test_cut(rows: int, ends: list[int]):
+    columns = log_of(["....t", "....."]).cut(rows)
+    assert len(columns["rewards"]) == rows
+    assert np.flatnonzero(columns["terminated"] | columns["truncated"]).tolist() == ends
+    assert columns["terminated"].any() == (ends[0] == 4)
+
+
+def test_the_log_grows():
+    log = log_of(["." * 3_000])
+    assert log.cut(2_999)["rewards"].tolist() == [10.0 * step for step in range(2_999)]

@@ -1,41 +1,115 @@
-"""The zoo: shipped snapshots of a learner act in MuJoCo, and what they live through becomes a dataset."""
+"""The zoo: snapshots of a learner act in MuJoCo, and what they live through becomes a dataset."""
 
+import math
 import multiprocessing
+import platform
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib import resources
-from importlib.resources.abc import Traversable
+from functools import cached_property
+from importlib.metadata import version
+from itertools import accumulate
+from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from envtf_lit.data.dataset import COLUMNS, OfflineDataset
+from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
 from envtf_lit.errors import UserError
 from envtf_lit.policy import Policy, RandomPolicy, TanhGaussianActor
 from envtf_lit.storage import load_weights, read_json
-from envtf_lit.tasks import Robot, Task
+from envtf_lit.tasks import ROBOTS, Robot, Task
 
-ZOO_TASKS = ("hopper-medium-replay",)
-ENVIRONMENTS = 8  # per phase; a constant, since the policy's rounding may depend on the batch size
-MIN_TRANSITIONS = 200
+ZOO = Path(__file__).parent.parent / "assets" / "zoo"
+ENVIRONMENTS = 8  # per unit of work; a constant, since the policy's rounding may depend on the batch size
+UNIT_ROWS = 24_000  # at most, per unit of work: three episodes of 1,000 steps in each environment, so none is wasted
+MIN_ROWS = 2  # of a phase and of an episode
 
-Episode = dict[str, np.ndarray]  # the columns of one episode, float32 and bool
+Columns = dict[str, np.ndarray]  # rows under the names in `COLUMNS`, float32 and bool
 
 
-@dataclass
-class Trace:
-    """An episode while it is lived: one tuple per transition, in the order of `COLUMNS`."""
+@dataclass(frozen=True)
+class Snapshot:
+    """A learner's policy after `steps` environment steps, and what its deterministic actions returned."""
 
-    rows: list[tuple] = field(default_factory=list)
-    finished: bool = False
+    steps: int
+    mean_return: float
+    return_std: float
+    mean_length: float
+
+
+@dataclass(frozen=True)
+class Series:
+    """A robot's snapshots along training, as a folder of safetensors and its `zoo.json` hold them.
+
+    Attributes:
+        robot: whose observations the snapshots know.
+        folder: holds `zoo.json` and, for each snapshot, `<steps>.safetensors`.
+        warm_up_steps: uniform random actions with which the learner began.
+        trained_with: algorithm and settings, in words.
+        architecture: of the `TanhGaussianActor`s.
+        snapshots: in the order of their steps.
+    """
+
+    robot: Robot
+    folder: Path
+    warm_up_steps: int
+    trained_with: str
+    architecture: dict[str, Any]
+    snapshots: tuple[Snapshot, ...]
+
+    @cached_property
+    def expert(self) -> Snapshot:
+        """The snapshot of highest return."""
+        return max(self.snapshots, key=lambda snapshot: snapshot.mean_return)
+
+    @cached_property
+    def medium(self) -> Snapshot:
+        """The snapshot, up to the expert, whose return is nearest to a third of the expert's."""
+        third = self.expert.mean_return / 3
+        return min(self.up_to(self.expert), key=lambda snapshot: abs(snapshot.mean_return - third))
+
+    def up_to(self, last: Snapshot) -> list[Snapshot]:
+        """The snapshots of the learner's life until it became `last`, which is included."""
+        return [snapshot for snapshot in self.snapshots if snapshot.steps <= last.steps]
+
+
+def read_series(robot: Robot, zoo: Path | None = None) -> Series:
+    """The snapshots of a robot (or of the robot it is a variant of).
+
+    Args:
+        robot: any of ours.
+        zoo: a folder that `envtf zoo train` wrote; None takes the zoo that is part of this package.
+
+    Raises:
+        UserError: that folder has no (or no valid) series of this robot.
+    """
+    folder = (zoo or ZOO) / robot.name
+    content = read_json(folder / "zoo.json")
+    try:
+        snapshots = tuple(Snapshot(**snapshot) for snapshot in content["snapshots"])
+        known = {name: content[name] for name in ("warm_up_steps", "trained_with", "architecture")}
+    except (KeyError, TypeError) as error:
+        raise UserError(f"{folder}/zoo.json is not what `envtf zoo train` writes ({error}): train anew.") from None
+    return Series(ROBOTS[robot.name], folder, snapshots=snapshots, **known)
+
+
+def load_snapshot(series: Series, steps: int) -> TanhGaussianActor:
+    """The behaviour policy after that many environment steps of training.
+
+    Raises:
+        UserError: its file is missing, damaged or of another shape.
+    """
+    robot = series.robot
+    actor = TanhGaussianActor(robot.observation_dim, robot.action_dim, **series.architecture)
+    load_weights(actor, series.folder / f"{steps:07d}.safetensors")
+    return actor.eval()
 
 
 @dataclass(frozen=True)
@@ -43,9 +117,9 @@ class Phase:
     """Consecutive rows of the dataset that one policy collects.
 
     Attributes:
-        steps: environment steps the snapshot had been trained for; 0 is the learner's warm-up, uniform random actions.
+        steps: environment steps the snapshot had been trained for; 0 is uniform random actions.
         rows: transitions to collect.
-        mean_return: of the snapshot's deterministic actions, when it was taken; None for the warm-up.
+        mean_return: of the snapshot's deterministic actions; None for random actions.
     """
 
     steps: int
@@ -53,90 +127,155 @@ class Phase:
     mean_return: float | None
 
 
-def read_zoo(robot: Robot) -> dict[str, Any]:
-    """What is known of a robot's snapshots: returns, architecture and how they were trained."""
-    with resources.as_file(_zoo(robot) / "zoo.json") as path:
-        return read_json(path)
+def plan(task: Task, transitions: int, series: Series | None = None) -> list[Phase]:
+    """Who collects how much of a task's dataset, in this order.
 
+    - `random`: uniform actions.
+    - `medium`: the snapshot whose return is nearest to a third of the expert's.
+    - `medium-replay`: the replay buffer of a learner that stops there: its random warm-up, then each snapshot with a
+      share equal to the training steps since the snapshot before it.
+    - `full-replay`: the same up to the expert, the snapshot of highest return.
+    - `medium-expert`: half medium, half expert.
 
-def load_snapshot(robot: Robot, steps: int) -> TanhGaussianActor:
-    """The behaviour policy after that many environment steps of training."""
-    actor = TanhGaussianActor(robot.observation_dim, robot.action_dim, **read_zoo(robot)["architecture"])
-    with resources.as_file(_zoo(robot) / f"{steps:07d}.safetensors") as path:
-        load_weights(actor, path)
-    return actor.eval()
-
-
-def plan(task: Task, transitions: int) -> list[Phase]:
-    """Who collects how much of a task's dataset, in the order of the learner's life.
-
-    `medium-replay` mimics the replay buffer of a learner that stops at medium strength: its random warm-up, then each
-    snapshot up to the medium one (nearest to a third of the expert's return) with a share equal to the training steps
-    since the snapshot before it.
+    Args:
+        task: robot and tier.
+        transitions: rows in all.
+        series: the robot's snapshots; None takes the package's.
 
     Raises:
-        UserError: the zoo has no such task, or `transitions` is too small to give every phase two rows.
+        UserError: `transitions` is too small to give every policy two rows.
     """
-    if task.name not in ZOO_TASKS:
+    series = series or read_series(task.robot)
+    policies = _policies(task.tier, series)
+    ends = np.array(list(accumulate(share for _, share in policies)))
+    rows = np.diff(np.rint(ends / ends[-1] * transitions).astype(int), prepend=0)
+    if rows.min() < MIN_ROWS:
+        least = math.ceil(MIN_ROWS * ends[-1] / min(share for _, share in policies))
         raise UserError(
-            f"The zoo has no snapshots for {task.name}: choose {', '.join(ZOO_TASKS)}, or set download.source to file."
+            f"{transitions} transitions are too few for the {len(policies)} policies of {task.name}: ask for {least} "
+            "or more."
         )
-    if transitions < MIN_TRANSITIONS:
-        raise UserError(f"download.transitions is {transitions}: the zoo needs at least {MIN_TRANSITIONS}.")
-    zoo = read_zoo(task.robot)
-    third = zoo["expert"]["mean_return"] / 3
-    medium = min(zoo["snapshots"], key=lambda snapshot: abs(snapshot["mean_return"] - third))
-    learner = [snapshot for snapshot in zoo["snapshots"] if snapshot["steps"] <= medium["steps"]]
-    ends = np.array([zoo["warm_up_steps"], *(snapshot["steps"] for snapshot in learner)])
-    row_ends = np.rint(ends / ends[-1] * transitions).astype(int)
-    rows = [int(count) for count in np.diff(row_ends, prepend=0)]
     return [
-        Phase(0, rows[0], None),
-        *(Phase(s["steps"], count, s["mean_return"]) for s, count in zip(learner, rows[1:], strict=True)),
+        Phase(snapshot.steps if snapshot else 0, int(count), snapshot.mean_return if snapshot else None)
+        for (snapshot, _), count in zip(policies, rows, strict=True)
     ]
 
 
-def collect(task: Task, transitions: int, *, seed: int, workers: int, progress: bool = True) -> OfflineDataset:
+def _policies(tier: str, series: Series) -> list[tuple[Snapshot | None, int]]:
+    """A tier's policies (None acts at random) and their shares of the rows, in any unit."""
+    if tier == "random":
+        return [(None, 1)]
+    if tier == "medium":
+        return [(series.medium, 1)]
+    if tier == "medium-expert":
+        return [(series.medium, 1), (series.expert, 1)]
+    learner = series.up_to(series.medium if tier == "medium-replay" else series.expert)
+    ends = [series.warm_up_steps, *(snapshot.steps for snapshot in learner)]
+    return list(zip([None, *learner], np.diff(ends, prepend=0).tolist(), strict=True))
+
+
+def describe_origin(task: Task, transitions: int, seed: int, zoo: Path | None = None) -> dict[str, Any]:
+    """How `collect` makes a dataset, for its card: policies with their returns and scores, seed, environment, versions.
+
+    Two datasets of equal origin have equal bytes, on machines that round alike.
+    """
+    series, robot = read_series(task.robot, zoo), task.robot
+    policies = [
+        {
+            "policy": f"snapshot after {phase.steps:,} steps" if phase.steps else "uniform random",
+            "steps": phase.steps,
+            "transitions": phase.rows,
+            "mean_return_deterministic": phase.mean_return,
+            "score_deterministic": None if phase.mean_return is None else robot.normalised_score(phase.mean_return),
+        }
+        for phase in plan(task, transitions, series)
+    ]
+    versions = {name: version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")}
+    return {
+        "seed": seed,
+        "actions": "stochastic",
+        "env_id": robot.env_id,
+        "env_kwargs": robot.env_kwargs,
+        "policies": policies,
+        "trained_with": series.trained_with,
+        "versions": {**versions, "python": platform.python_version()},
+        "note": (
+            f"Collected in {robot.env_id} by this package's own behaviour policies: these are not D4RL's files, and "
+            "scores compare among themselves, not with D4RL's tables."
+        ),
+    }
+
+
+def collect(
+    task: Task, transitions: int, *, seed: int, workers: int, zoo: Path | None = None, progress: bool = True
+) -> OfflineDataset:
     """Lets the task's behaviour policies act in MuJoCo, with stochastic actions.
 
-    The bytes depend on `seed` and `transitions`, not on `workers`: each phase of the plan is one unit of work with its
-    own seeds, and phases are merged in order. Only the last episode of each phase is cut, and marked truncated.
+    The bytes depend on `seed` and `transitions`, not on `workers`: each phase of the plan is cut into units of work
+    with their own seeds, which are merged in order. Only the last episode of each unit is cut, and marked truncated.
 
     Args:
-        task: one of `ZOO_TASKS`.
+        task: robot and tier; the variants of Ant with more observations are driven by their first 27.
         transitions: rows of the dataset, exactly.
         seed: of the environments and the actions.
         workers: processes; above 1 a calling script needs its `if __name__ == "__main__":`.
+        zoo: a folder that `envtf zoo train` wrote; None takes the package's snapshots.
         progress: shows a bar with the time left.
 
     Raises:
-        UserError: the zoo has no such task, `transitions` is too small, or a worker process died.
+        UserError: `transitions` is too small, a snapshot cannot be read, or a worker process died.
     """
-    phases = plan(task, transitions)
-    episodes: list[list[Episode]] = [[] for _ in phases]
+    series = read_series(task.robot, zoo)
+    units = [unit for phase in plan(task, transitions, series) for unit in _units(phase)]
+    starts = [0, *accumulate(unit.rows for unit in units)]
+    columns = _empty_columns(task.robot, (transitions,))
     with _progress_bar(transitions, task.name, progress) as advance:
-        for index, collected in _run(task.robot, phases, seed, workers):
-            episodes[index] = collected
-            advance(phases[index].rows)
-    return _merge([episode for unit in episodes for episode in unit], task)
+        for index, collected in _run(task.robot, series, units, seed, workers):
+            for name, rows in collected.items():
+                columns[name][starts[index] : starts[index + 1]] = rows
+            advance(units[index].rows)
+    limit = np.full(task.robot.action_dim, task.robot.action_limit, dtype=np.float32)
+    return OfflineDataset(
+        **columns,
+        episode_starts=starts_from_ends(columns["terminated"] | columns["truncated"]),
+        action_low=-limit,
+        action_high=limit,
+        task=task.name,
+    )
 
 
-def _zoo(robot: Robot) -> Traversable:
-    return resources.files("envtf_lit") / "assets" / "zoo" / robot.name
+def _units(phase: Phase) -> list[Phase]:
+    """A phase in parts of at most `UNIT_ROWS` rows; the last holds what is left, at least `MIN_ROWS`."""
+    parts = []
+    left = phase.rows
+    while left > 0:
+        rows = min(UNIT_ROWS, left)
+        if 0 < left - rows < MIN_ROWS:
+            rows -= MIN_ROWS
+        parts.append(Phase(phase.steps, rows, phase.mean_return))
+        left -= rows
+    return parts
 
 
-def _run(robot: Robot, phases: list[Phase], seed: int, workers: int) -> Iterator[tuple[int, list[Episode]]]:
-    """Yields (index of the phase, its episodes) as they are done."""
-    jobs = sorted(enumerate(phases), key=lambda job: -job[1].rows)  # the longest first, so that all end together
+def _empty_columns(robot: Robot, shape: tuple[int, ...]) -> Columns:
+    widths = {"observations": (robot.observation_dim,), "actions": (robot.action_dim,)}
+    widths["next_observations"] = widths["observations"]
+    kinds = {"terminated": bool, "truncated": bool}
+    return {name: np.empty(shape + widths.get(name, ()), kinds.get(name, np.float32)) for name in COLUMNS}
+
+
+def _run(robot: Robot, series: Series, units: list[Phase], seed: int, workers: int) -> Iterator[tuple[int, Columns]]:
+    """Yields (index of the unit, its rows) as they are done."""
+    jobs = sorted(enumerate(units), key=lambda job: -job[1].rows)  # the longest first, so that all end together
     if workers <= 1:
-        yield from ((index, _collect_phase(robot, phase, seed, index)) for index, phase in jobs)
+        yield from ((index, _collect_unit(robot, series, unit, seed, index)) for index, unit in jobs)
         return
     context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
     with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context) as pool:
         try:
-            futures = {pool.submit(_collect_phase, robot, phase, seed, index): index for index, phase in jobs}
+            futures = {pool.submit(_collect_unit, robot, series, unit, seed, index): index for index, unit in jobs}
             for future in as_completed(futures):
-                yield futures[future], future.result()
+                yield futures.pop(future), future.result()  # popped: a finished future holds its rows
         except BrokenProcessPool:
             raise UserError(
                 f"One of {workers} collecting processes died: free some memory or use one worker, and in a script of "
@@ -144,89 +283,111 @@ def _run(robot: Robot, phases: list[Phase], seed: int, workers: int) -> Iterator
             ) from None
 
 
-def _collect_phase(robot: Robot, phase: Phase, seed: int, index: int) -> list[Episode]:
+def _collect_unit(robot: Robot, series: Series, unit: Phase, seed: int, index: int) -> Columns:
     """One unit of work, the same in any process: episodes in the order they began, the last one cut to fit."""
     *env_seeds, action_seed = np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(ENVIRONMENTS + 1).tolist()
     generator = torch.Generator().manual_seed(action_seed)
     with _one_thread():
-        traces = _act(robot, _policy(robot, phase.steps), phase.rows, env_seeds, generator)
-    return _cut(traces, phase.rows)
+        return _act(robot, _policy(series, unit.steps), unit.rows, env_seeds, generator)
 
 
-def _policy(robot: Robot, steps: int) -> Policy:
+def _policy(series: Series, steps: int) -> Policy:
     if steps > 0:
-        return load_snapshot(robot, steps)
-    limit = torch.full((robot.action_dim,), robot.action_limit)
+        return load_snapshot(series, steps)
+    limit = torch.full((series.robot.action_dim,), series.robot.action_limit)
     return RandomPolicy(-limit, limit)
 
 
-def _act(robot: Robot, policy: Policy, rows: int, seeds: list[int], generator: torch.Generator) -> list[Trace]:
-    """Episodes in the order they began, enough of them for `rows`; all but the last are whole.
+def _act(robot: Robot, policy: Policy, rows: int, seeds: list[int], generator: torch.Generator) -> Columns:
+    """Steps all environments until their episodes, in the order they began, hold `rows` transitions, and cuts those.
 
     Taking them in that order, not in the order they end, keeps short episodes from being over-represented.
     """
-    envs = SyncVectorEnv(
-        [lambda: gym.make(robot.env_id, **robot.env_kwargs)] * len(seeds), autoreset_mode=AutoresetMode.NEXT_STEP
-    )
-    current = [Trace() for _ in seeds]
-    begun = list(current)
+    envs = SyncVectorEnv([robot.make] * len(seeds), autoreset_mode=AutoresetMode.NEXT_STEP)
+    log = _Log(robot, len(seeds))
+    seen = ROBOTS[robot.name].observation_dim  # policies know the robot without what a variant adds
     observation, _ = envs.reset(seed=[*seeds])
-    while sum(len(trace.rows) for trace in _usable(begun)) <= rows:
-        action = policy.act(torch.as_tensor(observation, dtype=torch.float32), False, generator).numpy()
+    while log.usable_rows() <= rows:
+        action = policy.act(torch.as_tensor(observation[:, :seen], dtype=torch.float32), False, generator).numpy()
         following, reward, terminated, truncated, _ = envs.step(action)
-        for index, trace in enumerate(current):
-            if trace.finished:  # this step was the automatic reset, which is no transition: its action was ignored
-                current[index] = Trace()
-                begun.append(current[index])
-                continue
-            fell = bool(terminated[index])
-            row = (observation[index], action[index], reward[index], following[index], fell)
-            trace.rows.append((*row, bool(truncated[index]) and not fell))
-            trace.finished = fell or bool(truncated[index])
+        log.append(observation, action, reward, following, terminated, truncated & ~terminated)
         observation = following
     envs.close()
-    return _usable(begun)
+    return log.cut(rows)
 
 
-def _usable(begun: list[Trace]) -> list[Trace]:
-    """The finished episodes up to the first running one, and that one, which can still be cut."""
-    first_running = next((index for index, trace in enumerate(begun) if not trace.finished), len(begun))
-    return begun[: first_running + 1]
+@dataclass
+class _Trace:
+    """An episode: the steps from `start` to `stop` of one environment; `stop` is None while it runs."""
+
+    environment: int
+    start: int
+    stop: int | None = None
 
 
-def _cut(traces: list[Trace], rows: int) -> list[Episode]:
-    """The first `rows` transitions of these episodes, which hold at least one more; a cut marks its row truncated."""
-    episodes = []
-    for trace in traces:
-        take = min(len(trace.rows), rows)
-        if rows - take == 1:  # a lone row is no episode: leave two for the next
-            take -= 1
-        if take == 0:
-            break
-        episode = _columns(trace.rows[:take])
-        episode["truncated"][-1] = not episode["terminated"][-1]
-        episodes.append(episode)
-        rows -= take
-    return episodes
+@dataclass
+class _Log:
+    """What E environments live through, step after step, in arrays (T, E, ...) that grow; episodes point into it.
 
+    Attributes:
+        robot: gives the columns their widths.
+        environments: E.
+        steps: T so far.
+        episodes: in the order they began.
+        finished: leading episodes that are over.
+        finished_rows: transitions in those.
+    """
 
-def _columns(rows: list[tuple]) -> Episode:
-    return {
-        name: np.asarray(values, dtype=bool if name in ("terminated", "truncated") else np.float32)
-        for name, values in zip(COLUMNS, zip(*rows, strict=True), strict=True)
-    }
+    robot: Robot
+    environments: int
+    steps: int = 0
+    episodes: list[_Trace] = field(default_factory=list)
+    finished: int = 0
+    finished_rows: int = 0
 
+    def __post_init__(self) -> None:
+        self.columns = _empty_columns(self.robot, (1_024, self.environments))
+        self.running = [_Trace(environment, 0) for environment in range(self.environments)]
+        self.episodes += self.running
 
-def _merge(episodes: list[Episode], task: Task) -> OfflineDataset:
-    lengths = [len(episode["rewards"]) for episode in episodes]
-    limit = np.full(task.robot.action_dim, task.robot.action_limit, dtype=np.float32)
-    return OfflineDataset(
-        **{name: np.concatenate([episode[name] for episode in episodes]) for name in COLUMNS},
-        episode_starts=np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64),
-        action_low=-limit,
-        action_high=limit,
-        task=task.name,
-    )
+    def append(self, *values: np.ndarray) -> None:
+        """One step of all environments: arrays (E, ...) in the order of `COLUMNS`."""
+        if self.steps == len(self.columns["rewards"]):
+            self.columns = {name: np.concatenate([rows, np.empty_like(rows)]) for name, rows in self.columns.items()}
+        for name, value in zip(COLUMNS, values, strict=True):
+            self.columns[name][self.steps] = value
+        self.steps += 1
+        for environment, trace in enumerate(self.running):
+            if trace.stop is not None:  # this step was the automatic reset, which is no transition: no episode has it
+                self.running[environment] = _Trace(environment, self.steps)
+                self.episodes.append(self.running[environment])
+            elif values[-2][environment] or values[-1][environment]:
+                trace.stop = self.steps
+
+    def usable_rows(self) -> int:
+        """Transitions in the finished episodes up to the first running one, and in that one, which can still be cut."""
+        while self.finished < len(self.episodes) and (stop := self.episodes[self.finished].stop) is not None:
+            self.finished_rows += stop - self.episodes[self.finished].start
+            self.finished += 1
+        running = self.steps - self.episodes[self.finished].start if self.finished < len(self.episodes) else 0
+        return self.finished_rows + running
+
+    def cut(self, rows: int) -> Columns:
+        """The first `rows` transitions, of at least one more; an episode that loses its end is truncated there."""
+        taken = {name: np.empty((rows, *values.shape[2:]), values.dtype) for name, values in self.columns.items()}
+        begin = 0
+        for trace in self.episodes:
+            count = min((self.steps if trace.stop is None else trace.stop) - trace.start, rows - begin)
+            if rows - begin - count == 1:  # a lone row is no episode: leave two for the next
+                count -= 1
+            if count == 0:
+                break
+            for name, values in self.columns.items():
+                taken[name][begin : begin + count] = values[trace.start : trace.start + count, trace.environment]
+            begin += count
+            taken["truncated"][begin - 1] = not taken["terminated"][begin - 1]
+        assert begin == rows, f"an episode of one step left {rows - begin} of {rows} rows empty"
+        return taken
 
 
 @contextmanager

@@ -1,14 +1,12 @@
 """Where datasets come from, and the card that says what one holds."""
 
-import platform
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from envtf_lit.data.behaviour import collect, plan
+from envtf_lit.data.behaviour import collect, describe_origin
 from envtf_lit.data.d4rl import load_d4rl
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.fetch import sha256
@@ -54,7 +52,7 @@ def make_dataset(
         case "zoo":
             assert task is not None
             dataset = collect(task, options.transitions, seed=seed, workers=workers, progress=progress)
-            return dataset, _zoo_origin(task, options.transitions, seed)
+            return dataset, describe_origin(task, options.transitions, seed)
         case "d4rl":
             assert task is not None
             dataset, origin = load_d4rl(task, options.path, progress=progress)
@@ -116,27 +114,4 @@ def _distribution(values: np.ndarray) -> dict[str, float]:
         "min": float(values.min()),
         **quantiles,
         "max": float(values.max()),
-    }
-
-
-def _zoo_origin(task: Task, transitions: int, seed: int) -> dict[str, Any]:
-    policies = [
-        {
-            "policy": f"snapshot after {phase.steps} steps" if phase.steps else "uniform random (warm-up)",
-            "steps": phase.steps,
-            "transitions": phase.rows,
-            "mean_return_deterministic": phase.mean_return,
-        }
-        for phase in plan(task, transitions)
-    ]
-    versions = {name: version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")}
-    return {
-        "seed": seed,
-        "actions": "stochastic",
-        "policies": policies,
-        "versions": {**versions, "python": platform.python_version()},
-        "note": (
-            f"Collected in {task.robot.env_id} by this package's own behaviour policies: these are not D4RL's files, "
-            "and scores compare among themselves, not with D4RL's tables."
-        ),
     }
