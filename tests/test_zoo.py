@@ -1,0 +1,123 @@
+"""`envtf zoo`: a folder of datasets with cards, a table and a figure; whole or absent, continued where it stopped."""
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from PIL import Image
+
+from envtf_lit import zoo as zoo_module
+from envtf_lit.cli import main
+from envtf_lit.data.formats import load_dataset
+from envtf_lit.errors import UserError
+from envtf_lit.tasks import TASKS
+from envtf_lit.zoo import Entry, build, catalogue
+
+NAMES = ["hopper-medium", "hopper-random", "ant-random-105d", "halfcheetah-random-v4"]
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("zoo")
+    main(["zoo", "build", *NAMES, "--out", str(folder), "--transitions", "300", "--workers", "1", "--quiet"])
+    return folder
+
+
+def build_again(folder: Path, names: list[str], transitions: int = 300, seed: int = 0) -> list[Entry]:
+    return build(names, folder, transitions=transitions, seed=seed, workers=1, progress=False, report=lambda line: None)
+
+
+def test_every_dataset_has_a_card_and_a_page(out: Path) -> None:
+    for name in NAMES:
+        dataset, card = load_dataset(out / f"{name}.h5"), json.loads((out / f"{name}.json").read_text())
+        page = (out / f"{name}.md").read_text()
+        assert dataset.task == card["task"] == name
+        assert card["transitions"] == len(dataset) == 300
+        assert card["returns"]["mean"] == pytest.approx(dataset.episode_returns.mean())
+        assert card["bytes"] == (out / f"{name}.h5").stat().st_size
+        for fact in (f"# {name}\n", card["env_id"], card["versions"]["mujoco"], "are not D4RL's files"):
+            assert fact in page
+        for policy in card["policies"]:
+            assert f"| {policy['policy']} | {policy['transitions']:,} |" in page
+    assert "`include_cfrc_ext_in_observation" not in (out / "ant-random-105d.md").read_text()
+    assert "HalfCheetah-v4" in (out / "halfcheetah-random-v4.md").read_text()
+
+
+def test_table_and_figure_show_all_of_them(out: Path) -> None:
+    rows = json.loads((out / "index.json").read_text())
+    assert [row["task"] for row in rows] == ["hopper-random", "hopper-medium", *NAMES[2:]]
+    page = (out / "index.md").read_text()
+    for row in rows:
+        card = json.loads((out / f"{row['task']}.json").read_text())
+        assert row["max_score"] == pytest.approx(card["scores"]["max"], abs=0.01)
+        assert row["megabytes"] == pytest.approx(card["bytes"] / 1e6, abs=0.1)
+        assert f"| [{row['task']}]({row['task']}.md) | {row['env_id']} | 300 |" in page
+    with Image.open(out / "returns.png") as figure:
+        assert figure.size[0] > 500
+    drawn = pd.read_csv(out / "returns.csv").set_index("task")
+    assert drawn["mean"].to_dict() == pytest.approx({row["task"]: row["mean_score"] for row in rows}, abs=0.01)
+
+
+def test_what_is_there_is_left_alone_and_what_was_asked_otherwise_is_made_anew(out: Path) -> None:
+    path = out / "hopper-medium.h5"
+    before = {file.name: file.stat().st_mtime_ns for file in out.glob("*.h5")}
+    build_again(out, NAMES)
+    assert {file.name: file.stat().st_mtime_ns for file in out.glob("*.h5")} == before
+    (row,) = (entry for entry in build_again(out, ["hopper-medium"], transitions=310) if entry.task == "hopper-medium")
+    assert (row.transitions, len(load_dataset(path))) == (310, 310)
+    content = path.read_bytes()
+    build_again(out, ["hopper-medium"], transitions=310, seed=1)
+    assert path.read_bytes() != content
+    build_again(out, ["hopper-medium"])
+
+
+def test_a_dataset_without_its_card_is_unfinished(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after an interrupt between the two: the next call makes it again."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(zoo_module, "card_page", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            build_again(out, ["hopper-random", "hopper-medium"], transitions=320)
+    assert not (out / "hopper-random.json").exists()
+    assert not list(out.glob(".*partial"))
+    table = build_again(out, ["hopper-random"])
+    assert [entry.transitions for entry in table if entry.task == "hopper-random"] == [300]
+
+
+def test_all_means_the_twenty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = {}
+    monkeypatch.setattr(zoo_module, "build", lambda tasks, out, **options: asked.update(options, tasks=tasks, out=out))
+    main(["zoo", "build", "--all", "--full", "--out", str(tmp_path)])
+    assert asked["tasks"] == [*TASKS]
+    assert (asked["transitions"], asked["seed"], asked["out"]) == (1_000_000, 0, tmp_path)
+    main(["zoo", "build", "ant-medium"])
+    assert (asked["tasks"], asked["transitions"], asked["out"]) == (["ant-medium"], 200_000, Path("data/zoo"))
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ([], "No task is named"),
+        (["hoper-medium"], "hopper-medium"),
+        (["hopper-full-replay"], "3 transitions are too few"),
+    ],
+)
+def test_impossible_wishes_are_refused_before_anything_is_made(names: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=message):
+        build_again(tmp_path, ["hopper-random", *names] if names else names, transitions=3)
+    assert not list(tmp_path.iterdir())
+
+
+def test_list_names_the_twenty(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["zoo", "list"])
+    shown = capsys.readouterr().out
+    assert [name for name in TASKS if name not in shown] == []
+    words = {name: policies for name, policies, _ in catalogue()}
+    assert words["hopper-random"] == "uniform random actions"
+    assert words["hopper-medium"] == "snapshot after 150,000 steps"
+    assert words["hopper-medium-replay"] == "random warm-up, then 12 snapshots up to 150,000 steps"
+    assert words["hopper-medium-expert"] == "snapshots after 150,000 and 550,000 steps, half each"
