@@ -88,6 +88,7 @@ def build_parser() -> argparse.ArgumentParser:
     for command in (init, params):
         command.add_argument("--preset", default="small", help="tiny, small, base or paper; default: small")
     _add_data(commands)
+    _add_zoo(commands)
     _add(commands, "doctor", "Print versions, threads, GL, disk and GPU for a bug report", _doctor)
     return parser
 
@@ -105,6 +106,33 @@ def _add_data(commands: Any) -> None:
     convert.add_argument("target", metavar="OUT", help="a new file ending in .h5, .hdf5 or .npz, or minari:ID")
     for command in (check, convert):
         command.add_argument("--task", help="robot and tier that the data came from, such as hopper-medium")
+
+
+def _add_zoo(commands: Any) -> None:
+    summary = "Datasets of four robots from behaviour policies that come along: list, build, or train your own"
+    zoo = commands.add_parser("zoo", help=summary, description=f"{summary}.")
+    verbs = zoo.add_subparsers(dest="verb", required=True, metavar="VERB")
+    listing = _add(verbs, "list", "Print the twenty datasets and the policies behind each", _zoo_list)
+    build = _add(verbs, "build", "Collect datasets into a folder, with cards, a table and a figure", _zoo_build)
+    build.add_argument(
+        "tasks", nargs="*", metavar="TASK", help="such as hopper-medium, hopper-medium-v4, ant-medium-105d"
+    )
+    build.add_argument("--all", action="store_true", help="the twenty")
+    build.add_argument("--out", type=Path, default=Path("data/zoo"), metavar="DIR", help="default: data/zoo")
+    size = build.add_mutually_exclusive_group()
+    size.add_argument("--transitions", type=int, metavar="N", help="rows of each; default: 200,000")
+    size.add_argument("--full", action="store_true", help="1,000,000 rows of each")
+    build.add_argument("--workers", type=int, default=2, help="processes; they do not change the data; default: 2")
+    train = _add(verbs, "train", "Train behaviour policies (needs the extra `behaviour`)", _zoo_train)
+    train.add_argument("--robot", required=True, choices=["ant", "halfcheetah", "hopper", "walker2d"])
+    train.add_argument("--out", type=Path, required=True, metavar="DIR", help="for build's and list's --zoo")
+    train.add_argument("--algorithm", choices=["crossq", "sac"], default="crossq", help="default: crossq")
+    train.add_argument("--steps", type=int, default=600_000, help="environment steps; default: 600,000")
+    for command in (build, train):
+        command.add_argument("--seed", type=int, default=0, help="default: 0")
+        command.add_argument("--quiet", action="store_true", help="no progress bars")
+    for command in (listing, build):
+        command.add_argument("--zoo", type=Path, metavar="DIR", help="policies of your own, from `envtf zoo train`")
 
 
 class _LazyHelp(argparse.ArgumentParser):
@@ -232,3 +260,52 @@ def _convert(namespace: argparse.Namespace, rest: list[str]) -> None:
     console.print(f"Wrote {len(dataset):,} transitions to {namespace.target}", markup=False)
     for finding in findings:
         console.print(f"{finding.kind}: {finding}", markup=False)
+
+
+def _zoo_list(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from envtf_lit.zoo import catalogue
+
+    table = Table("dataset", "policies", "score of their deterministic actions", box=None)
+    for line in catalogue(namespace.zoo):
+        table.add_row(*line)
+    Console().print(table)
+
+
+def _zoo_build(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.tasks import TASKS
+    from envtf_lit.zoo import FULL, TRANSITIONS, build
+
+    console = Console(highlight=False, markup=False, soft_wrap=True)
+    build(
+        [*TASKS] if namespace.all else namespace.tasks,
+        namespace.out,
+        transitions=FULL if namespace.full else TRANSITIONS if namespace.transitions is None else namespace.transitions,
+        seed=namespace.seed,
+        workers=namespace.workers,
+        zoo=namespace.zoo,
+        progress=not namespace.quiet,
+        report=console.print,
+    )
+    console.print(f"Table and figure: {namespace.out}/index.md")
+
+
+def _zoo_train(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.behaviour_training import train
+    from envtf_lit.tasks import ROBOTS
+
+    folder = train(
+        ROBOTS[namespace.robot],
+        namespace.out,
+        algorithm=namespace.algorithm,
+        steps=namespace.steps,
+        seed=namespace.seed,
+        progress=not namespace.quiet,
+    )
+    Console().print(f"Wrote {folder}. Next: envtf zoo build --zoo {namespace.out} TASK", soft_wrap=True)

@@ -50,7 +50,7 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(["--help"]) == 0
     text = capsys.readouterr().out
-    assert [command for command in [*COMMANDS, *LIGHTNING, "data"] if f"\n    {command}" not in text] == []
+    assert [command for command in [*COMMANDS, *LIGHTNING, "data", "zoo"] if f"\n    {command}" not in text] == []
 
 
 def test_help_is_quick() -> None:
