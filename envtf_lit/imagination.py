@@ -17,7 +17,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.params import ImaginationOptions
 from envtf_lit.policy import Policy, TanhGaussianActor
 from envtf_lit.storage import replacing
-from envtf_lit.world_models.interface import Mode, WorldModel
+from envtf_lit.world_models.interface import Mode, Prediction, WorldModel
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Rollouts:
         actions: (M, A).
         rewards: (M,), without any penalty.
         terminated: (M,) bool, by the robot's rule.
+        halted: (M,) bool, where the rollout was given up because the model had left what it knows.
         aleatoric: (M, S + 1) predicted standard deviation of (next observation, reward).
         uncertainty: (M,) `Prediction.uncertainty` of each transition.
         branch: (M,) which rollout; step: (M,) how many imagined steps came before.
@@ -39,6 +40,7 @@ class Rollouts:
     rewards: Tensor
     next_observations: Tensor
     terminated: Tensor
+    halted: Tensor
     aleatoric: Tensor
     uncertainty: Tensor
     branch: Tensor
@@ -47,7 +49,9 @@ class Rollouts:
     def __len__(self) -> int:
         return len(self.rewards)
 
-    def returns(self, rewards: Tensor, discount: float) -> tuple[Tensor, Tensor, Tensor]:
+    def returns(
+        self, rewards: Tensor, discount: float, halt_value: float | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Multi-step transitions that run from each imagined step to the end of its rollout.
 
         Args:
@@ -126,6 +130,7 @@ def imagine(
     horizon: int,
     terminated: Callable[[Tensor], Tensor],
     tail: int = 0,
+    novelty_limit: float | None = None,
     mode: Mode = "sample",
     generator: torch.Generator | None = None,
     batch_size: int = 4_096,
@@ -138,6 +143,7 @@ def imagine(
         model: any world model; `starts` are the arguments of its `init`.
         policy: acts on (B, S).
         terminated: the robot's rule, next observations (B, S) to bool (B,).
+        novelty_limit: rollouts whose `Prediction.novelty` passes it end there, halted; None lets them go on.
         tail: further steps, with the policy's deterministic actions and mean predictions.
         mode: of `WorldModel.step`.
         generator: of the actions and of sampled next states.
@@ -150,9 +156,9 @@ def imagine(
         branch = torch.arange(begin, begin + len(chunk[0]), device=chunk[0].device)
         for step in range(horizon + tail):
             actor, how = (policy, mode) if step < horizon else (_Deterministic(policy), "mean")
-            part, state = _advance(model, actor, state, branch, step, terminated, how, generator)
+            part, state = _advance(model, actor, state, branch, step, terminated, novelty_limit, how, generator)
             parts.append(part)
-            alive = (~part.terminated).nonzero()[:, 0]
+            alive = (~(part.terminated | part.halted)).nonzero()[:, 0]
             if len(alive) == 0:
                 break
             if len(alive) < len(branch):
@@ -196,6 +202,7 @@ class Imagination:
             horizon=o.horizon,
             tail=o.tail,
             terminated=self.terminated,
+            novelty_limit=o.novelty_limit,
             mode=o.mode,
             generator=generator,
         )
@@ -214,6 +221,7 @@ class Imagination:
             starts,
             horizon=self.options.selection_steps,
             terminated=self.terminated,
+            novelty_limit=self.options.novelty_limit,
             mode="mean",
         )
         return float(episodes.rewards.double().sum() / B)
@@ -236,6 +244,7 @@ def _advance(
     branch: Tensor,
     step: int,
     terminated: Callable[[Tensor], Tensor],
+    novelty_limit: float | None,
     mode: Mode,
     generator: torch.Generator | None,
 ) -> tuple[Rollouts, Any]:
@@ -243,18 +252,29 @@ def _advance(
     observation = model.current(state)
     action = policy.act(observation, deterministic=False, generator=generator)
     state, prediction = model.step(state, action, mode=mode, generator=generator)
+    fell = terminated(prediction.observation)
     part = Rollouts(
         observations=observation,
         actions=action,
         rewards=prediction.reward,
         next_observations=prediction.observation,
-        terminated=terminated(prediction.observation),
+        terminated=fell,
+        halted=torch.zeros_like(fell) if novelty_limit is None else ~fell & (_novelty(prediction) > novelty_limit),
         aleatoric=prediction.aleatoric,
         uncertainty=prediction.uncertainty,
         branch=branch,
         step=torch.full_like(branch, step),
     )
     return part, state
+
+
+def _novelty(prediction: Prediction) -> Tensor:
+    if prediction.novelty is None:
+        raise UserError(
+            "novelty_limit is set and the world model has no epistemic variance to hold against it: train one with "
+            "epistemic: laplace, or set novelty_limit to null."
+        )
+    return prediction.novelty
 
 
 def save_rollouts(rollouts: Rollouts, path: str | Path, *, provenance: dict[str, Any]) -> None:

@@ -38,6 +38,8 @@ class ModelOptions:
         objective: `beta_nll` (Seitzer et al. 2022), `nll`, or `paper_mse` (the paper's sampled mse, which drives every
             variance to zero).
         target: `delta` predicts the scaled change of the state, `absolute` the z-scored next state (the paper's form).
+        epistemic: where epistemic variance comes from: `laplace`, the posterior of the last layer, fitted after
+            training; `head`, the paper's third head, trained with the rest; `none`.
     """
 
     layers: int = 4
@@ -48,6 +50,7 @@ class ModelOptions:
     activation: Literal["relu", "gelu"] = "gelu"
     objective: Literal["beta_nll", "nll", "paper_mse"] = "beta_nll"
     target: Literal["delta", "absolute"] = "delta"
+    epistemic: Literal["laplace", "head", "none"] = "laplace"
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,8 @@ class GenerateRolloutsOptions:
         exploration: scale of the Gaussian noise added to the clone's sampled actions, in units of the action range's
             half.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
+        novelty_limit: rollouts end where the model's epistemic variance passes this multiple of its 0.999 quantile over
+            the training data; null lets them go on.
     """
 
     clone_updates: int = 2_000
@@ -101,6 +106,7 @@ class GenerateRolloutsOptions:
     history: int = 4
     exploration: float = 0.1
     mode: Literal["mean", "sample"] = "sample"
+    novelty_limit: float | None = 1.0
 
 
 @dataclass(frozen=True)
@@ -120,6 +126,8 @@ class ImaginationOptions:
         buffer_size: imagined transitions kept; the oldest leave first.
         multi_step: temporal-difference targets run to the end of the imagined rollout, not one step.
         penalty: weight of the uncertainty u, in units of the data's reward standard deviation: `r - weight * std * u`.
+        novelty_limit: rollouts end where the model's epistemic variance passes this multiple of its 0.999 quantile over
+            the training data; null lets them go on.
         penalty_up_on: rows on which the conservative term pushes Q up: `real` (COMBO's form) or `mixture` (the
             paper's equation 5 read literally, which rewards the policy's own imagined actions).
         selection_episodes: imagined episodes that judge the averaged actor after each epoch, from recorded first
@@ -137,6 +145,7 @@ class ImaginationOptions:
     buffer_size: int = 4_500
     multi_step: bool = True
     penalty: float = 0.0
+    novelty_limit: float | None = 1.0
     penalty_up_on: Literal["real", "mixture"] = "real"
     selection_episodes: int = 0
     selection_steps: int = 1_000

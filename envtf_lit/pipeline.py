@@ -74,6 +74,7 @@ def train_model(params: Params, root: Path = Path("."), *, progress: bool = True
             monitor="val/open_loop_error",
             gradient_clip=options.gradient_clip,
         )
+        lit.fit_epistemic(data)
         best = min(curves.rows, key=lambda row: row["val/open_loop_error"])
         metrics = {
             "parameters": sum(p.numel() for p in lit.model.parameters()),
@@ -126,6 +127,7 @@ def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool 
                 starts,
                 horizon=options.horizon,
                 terminated=_termination(params),
+                novelty_limit=options.novelty_limit,
                 mode=options.mode,
                 generator=generator,
             )
@@ -133,6 +135,7 @@ def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool 
         metrics = {
             "transitions": len(rollouts),
             "terminated": int(rollouts.terminated.sum()),
+            "halted": int(rollouts.halted.sum()),
             "uncertainty_mean": float(rollouts.uncertainty.mean()),
         }
         save_rollouts(rollouts, root / ROLLOUTS, provenance=key | {"task": params.task})

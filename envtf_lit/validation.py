@@ -38,7 +38,15 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("cql_weight", "clone_weight", "warm_start", "selection_episodes"), _NOT_NEGATIVE),
     **dict.fromkeys(("learning_rate", "actor_learning_rate", "critic_learning_rate"), _POSITIVE),
     **dict.fromkeys(
-        ("warm_start_learning_rate", "eps", "gradient_clip", "temperature", "initial_alpha", "return_temperature"),
+        (
+            "warm_start_learning_rate",
+            "eps",
+            "gradient_clip",
+            "temperature",
+            "initial_alpha",
+            "return_temperature",
+            "novelty_limit",
+        ),
         _POSITIVE,
     ),
     **dict.fromkeys(("dropout", "warmup", "discount"), _SHARE),
@@ -127,6 +135,7 @@ def check_rules(params: Params) -> None:
     _check_model(params.train_model.model)
     _check_epochs("train_model", params.train_model)
     _check_policies(params)
+    _check_novelty(params)
     _check_history("generate_rollouts", params.generate_rollouts.history, params.train_model.model)
 
 
@@ -162,6 +171,12 @@ def _check_model(model: ModelOptions) -> None:
             f"take a width that is a multiple of {2 * model.heads}."
         )
 
+    if model.objective == "paper_mse" and model.epistemic != "head":
+        raise UserError(
+            f"train_model.model.objective is paper_mse and epistemic is {model.epistemic}: that objective trains the "
+            "paper's third head, so set epistemic to head."
+        )
+
 
 def _check_policies(params: Params) -> None:
     policies = params.train_policy
@@ -185,6 +200,20 @@ def _check_policies(params: Params) -> None:
             )
     history = policies.et_cql.imagination.history
     _check_history("train_policy.et_cql.imagination", history, params.train_model.model)
+
+
+def _check_novelty(params: Params) -> None:
+    imagination, epistemic = params.train_policy.et_cql.imagination, params.train_model.model.epistemic
+    assert imagination is not None
+    for where, limit in (
+        ("generate_rollouts", params.generate_rollouts.novelty_limit),
+        ("train_policy.et_cql.imagination", imagination.novelty_limit),
+    ):
+        if limit is not None and epistemic != "laplace":
+            raise UserError(
+                f"{where}.novelty_limit is {limit} and train_model.model.epistemic is {epistemic}, which "
+                "knows no novelty: set the limit to null, or epistemic to laplace."
+            )
 
 
 def _check_epochs(section: str, options: TrainModelOptions | PolicyOptions) -> None:

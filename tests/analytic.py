@@ -18,6 +18,7 @@ class LinearWorld:
     gain: Tensor
     std: float = 0.1
     epistemic: float | None = None
+    novelty: Tensor | None = None
     observation_dim: int = 3
     action_dim: int = 1
 
@@ -30,7 +31,9 @@ class LinearWorld:
         epistemic = None if self.epistemic is None else torch.full_like(mean, self.epistemic)
         value = mean if mode == "mean" else mean + aleatoric * torch.randn(mean.shape, generator=generator)
         uncertainty, log_prob = aleatoric[:, 0], torch.zeros(len(mean))
-        prediction = Prediction(value[:, :-1], value[:, -1], mean, aleatoric, epistemic, uncertainty, log_prob)
+        prediction = Prediction(
+            value[:, :-1], value[:, -1], mean, aleatoric, epistemic, uncertainty, self.novelty, log_prob
+        )
         return value[:, :-1], prediction
 
     def observe(self, state: Tensor, observation: Tensor) -> Tensor:

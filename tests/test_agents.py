@@ -172,6 +172,7 @@ def make_rollouts(n: int) -> Rollouts:
         rewards=torch.ones(n),
         next_observations=torch.ones(n, S),
         terminated=torch.zeros(n, dtype=torch.bool),
+        halted=torch.zeros(n, dtype=torch.bool),
         aleatoric=torch.zeros(n, S + 1),
         uncertainty=torch.full((n,), 0.5),
         branch=torch.arange(n),

@@ -7,6 +7,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.imagination import BranchPoints, NoisyPolicy, Rollouts, imagine, load_rollouts, save_rollouts
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.world_models.transformer import EnvironmentTransformer
+from tests.analytic import linear_data, linear_world
 from tests.test_loaders import make_dataset
 
 
@@ -81,6 +82,19 @@ def test_tails_are_deterministic_and_only_their_rewards_are_remembered():
         rows = rollouts.step == step
         own = actor.act(rollouts.observations[rows], deterministic=True)
         assert torch.allclose(own, rollouts.actions[rows]) is (step >= 2)
+
+
+def test_rollouts_are_halted_where_the_model_has_left_what_it_knows():
+    world = linear_world(novelty=torch.tensor([0.5, 2.0, 0.9]))
+    actor, data = TanhGaussianActor(3, 1), linear_data((20, 20))
+    starts = BranchPoints(data).draw(3, 0, torch.Generator().manual_seed(0))
+    never = lambda observation: torch.zeros(len(observation), dtype=torch.bool)  # noqa: E731
+    rollouts = imagine(world, actor, starts, horizon=1, terminated=never, novelty_limit=1.0)
+    assert rollouts.halted.tolist() == [False, True, False] and not rollouts.terminated.any()
+    _, _, weight = rollouts.returns(rollouts.rewards, 0.9)
+    assert weight.tolist() == pytest.approx([0.9] * 3)  # a truncation: what lies beyond keeps its value
+    with pytest.raises(UserError, match="has no epistemic variance"):
+        imagine(linear_world(), actor, starts, horizon=1, terminated=never, novelty_limit=1.0)
 
 
 def test_noise_respects_the_action_range():

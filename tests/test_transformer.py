@@ -7,6 +7,7 @@ import torch
 
 from envtf_lit.errors import UserError
 from envtf_lit.params import ModelOptions
+from envtf_lit.world_models.interface import Prediction
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 from envtf_lit.world_models.transformer import EnvironmentTransformer, rotate
 
@@ -136,23 +137,64 @@ def test_paper_mse_has_the_expectation_that_collapses_its_variances():
     assert loss.item() == pytest.approx(4.0 + 0.5 + 0.25, rel=0.02)
 
 
-def test_only_the_papers_objective_claims_epistemic_uncertainty():
-    step = lambda model: model.step(  # noqa: E731
-        model.init(torch.zeros(1, 1, S), torch.zeros(1, 0, A), torch.ones(1).long()), torch.zeros(1, A)
-    )[1]
-    assert step(make_model()).epistemic is None
-    assert step(make_model(objective="paper_mse")).epistemic is not None
+def one_step(model: EnvironmentTransformer) -> Prediction:
+    with torch.no_grad():
+        state = model.init(torch.zeros(1, 1, S), torch.zeros(1, 0, A), torch.ones(1).long())
+        return model.step(state, torch.zeros(1, A))[1]
+
+
+def test_epistemic_variance_comes_from_where_the_options_say():
+    assert one_step(make_model(epistemic="none")).epistemic is None
+    unfitted, head = one_step(make_model()), one_step(make_model(epistemic="head"))
+    assert unfitted.epistemic is not None and not unfitted.epistemic.any() and not unfitted.novelty.any()
+    assert head.epistemic is not None and head.epistemic.all() and head.novelty is None
+
+
+def test_paper_mse_needs_the_papers_head():
+    with pytest.raises(UserError, match="epistemic is laplace: set it to head"):
+        make_model(objective="paper_mse")
+
+
+def test_an_epistemic_head_shares_the_likelihood_with_the_aleatoric_one():
+    model, (observations, actions) = make_model(epistemic="head", objective="nll"), sequences(2, 6)
+    batch = batch_of(observations, actions)
+    mean, aleatoric, epistemic = model(observations, actions)
+    target = model.normaliser.target(observations, batch["next_observations"], batch["rewards"])
+    expected = nll(mean, (aleatoric.exp() + epistemic.exp()).log(), target).mean() / (S + 1)
+    torch.testing.assert_close(model.loss(batch), expected)
+
+
+def test_uncertainty_and_density_take_in_the_fitted_posterior():
+    model, (observations, actions) = make_model(), sequences(40, 6)
+    before, laplace = one_step(model), model.laplace
+    assert laplace is not None
+    model.fit_epistemic([batch_of(observations, actions)], generator=torch.Generator().manual_seed(0))
+    after = one_step(model)
+    assert after.epistemic is not None and after.novelty is not None
+    assert torch.equal(after.aleatoric, before.aleatoric) and after.uncertainty > before.uncertainty
+    ratio = model.normaliser.target_std[:-1] / model.normaliser.observation_std
+    unit = torch.cat([ratio / model.normaliser.target_std[:-1], torch.zeros(1)])
+    expected = ((after.aleatoric.square() + after.epistemic.square()) * unit.square()).sum(-1).div(S).sqrt()
+    torch.testing.assert_close(after.uncertainty, expected)
+    leverage = after.novelty * laplace.limit
+    expected = laplace.variance(leverage) * model.normaliser.target_std.square()
+    torch.testing.assert_close(after.epistemic.square(), expected)
+
+
+def batch_of(observations: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+    B, T, _ = observations.shape
+    return dict(
+        observations=observations,
+        actions=actions,
+        next_observations=observations + 0.1,
+        rewards=torch.ones(B, T),
+        mask=torch.ones(B, T),
+    )
 
 
 def test_padding_does_not_change_the_loss():
     model, (observations, actions) = make_model(), sequences(2, 6)
-    batch = dict(
-        observations=observations,
-        actions=actions,
-        next_observations=observations + 0.1,
-        rewards=torch.ones(2, 6),
-        mask=torch.ones(2, 6),
-    )
+    batch = batch_of(observations, actions)
     batch["mask"][1, 3:] = 0.0
     expected = model.loss(batch)
     batch["observations"] = observations.clone()

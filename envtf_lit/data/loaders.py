@@ -193,6 +193,14 @@ class WindowData(L.LightningDataModule):
         """The same rows as in validation: no third split."""
         return self.val_dataloader()
 
+    def training_tiles(self, rows: int) -> DataLoader[dict[str, Tensor]]:
+        """Each training row once, or some `rows` of them, drawn as whole windows."""
+        windows = Windows(self.train, self.context)
+        tiles = windows.tiles()
+        order = torch.randperm(len(tiles), generator=epoch_generator(self.seed, 0, "tiles"))
+        kept = max(1, round(len(tiles) * min(1.0, rows / len(self.train))))
+        return _loader(windows, tiles[order[:kept]].split(256))
+
 
 class TransitionData(L.LightningDataModule):
     """Transitions for agents, several batches at a time.

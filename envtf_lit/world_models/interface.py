@@ -20,6 +20,8 @@ class Prediction:
         aleatoric: (B, S + 1) standard deviation of (next observation, reward) from the data's own noise.
         epistemic: (B, S + 1) standard deviation from lack of data, or None where the model has no such estimate.
         uncertainty: (B,) `||sqrt(S_au + S_eu)||_2 / sqrt(S)` over z-scored live observation dimensions: the penalty u.
+        novelty: (B,) epistemic variance as a multiple of its 0.999 quantile over the training data: beyond 1 the model
+            has left what it knows. None where the model has no such estimate.
         log_prob: (B,) log-density of (observation, reward) under the predictive distribution.
     """
 
@@ -29,6 +31,7 @@ class Prediction:
     aleatoric: Tensor
     epistemic: Tensor | None
     uncertainty: Tensor
+    novelty: Tensor | None
     log_prob: Tensor
 
 

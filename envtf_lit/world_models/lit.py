@@ -15,6 +15,7 @@ from envtf_lit.world_models.horizon import Scale, open_loop_error, segments
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 SELECTION_SEGMENTS, SELECTION_HORIZON = 256, 20  # open-loop stretches by which models are selected
+EPISTEMIC_TOKENS = 100_000  # training rows that the last layer's posterior is fitted to, at most
 
 
 class LitWorldModel(L.LightningModule):
@@ -53,6 +54,11 @@ class LitWorldModel(L.LightningModule):
             self.model.normaliser.fit(data.train)
         self.scale = Scale.of(data.train, self.device)
         self.segments = segments(data.held_out, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=self.seed).to(self.device)
+
+    def fit_epistemic(self, data: WindowData) -> None:
+        """Fits the model's epistemic variance to the training windows that `data` was set up with; once, at the end."""
+        batches = data.training_tiles(EPISTEMIC_TOKENS)
+        self.model.eval().fit_epistemic(batches, generator=epoch_generator(self.seed, 0, "clusters"))
 
     def on_train_epoch_start(self) -> None:
         # one stream per epoch, for dropout as for sampling: a resumed run draws what an uninterrupted one would have

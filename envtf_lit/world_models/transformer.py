@@ -5,6 +5,7 @@ are rotary and attention is a sliding window of `context` tokens in training and
 generation equals the uncached forward pass at every step, past the context length too.
 """
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, cast
 
@@ -15,6 +16,7 @@ from torch.nn import functional as F
 from envtf_lit.errors import UserError
 from envtf_lit.params import ModelOptions
 from envtf_lit.world_models.interface import Mode, Prediction
+from envtf_lit.world_models.laplace import LastLayerLaplace, clusters
 from envtf_lit.world_models.normaliser import Normaliser
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 
@@ -117,11 +119,12 @@ class TransformerState:
 class EnvironmentTransformer(nn.Module):
     """Predicts next state and reward with aleatoric variance, from up to `context` past state-action pairs.
 
-    With `objective="paper_mse"` a third head holds the paper's learned epistemic variance; with a proper score no head
-    claims epistemic uncertainty, since a score of y sees only the sum of the two (`epistemic` is then None).
+    Epistemic variance is the posterior of the last layer (`epistemic="laplace"`, zero until `laplace.fit`), or the
+    paper's third head. A score of the outcome sees only the sum of the two variances, so how such a head splits it is
+    arbitrary; it is there to reproduce the paper.
 
     Raises:
-        UserError: `heads` does not divide `width` into even parts.
+        UserError: `heads` does not divide `width` into even parts, or `paper_mse` lacks its third head.
     """
 
     def __init__(self, observation_dim: int, action_dim: int, **options: Any) -> None:
@@ -130,13 +133,19 @@ class EnvironmentTransformer(nn.Module):
         width, heads = self.options.width, self.options.heads
         if width % (2 * heads):
             raise UserError(f"width {width} does not split into {heads} heads of even size: choose width = 2k * heads.")
+        self.has_epistemic_head = self.options.epistemic == "head"
+        if self.options.objective == "paper_mse" and not self.has_epistemic_head:
+            raise UserError(
+                f"objective is paper_mse, which trains an epistemic head, and epistemic is {self.options.epistemic}: "
+                "set it to head."
+            )
         self.observation_dim, self.action_dim = observation_dim, action_dim
-        self.has_epistemic_head = self.options.objective == "paper_mse"
         self.normaliser = Normaliser(observation_dim, action_dim, delta=self.options.target == "delta")
         self.embed = nn.Linear(observation_dim + action_dim, width)
         self.blocks = nn.ModuleList(Block(self.options) for _ in range(self.options.layers))
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, (3 if self.has_epistemic_head else 2) * (observation_dim + 1))
+        self.laplace = LastLayerLaplace(width, observation_dim + 1) if self.options.epistemic == "laplace" else None
         self.apply(_initialise)
         for block in self._stack():  # residual branches start small: sum of 2L terms keeps unit scale (GPT-2)
             for weight in (block.attention.out.weight, block.mlp[2].weight):
@@ -202,8 +211,32 @@ class EnvironmentTransformer(nn.Module):
             assert epistemic is not None
             loss = paper_mse(mean, log_variance, epistemic, target, generator=generator)
         else:
+            if epistemic is not None:
+                log_variance = torch.logaddexp(log_variance, epistemic)
             loss = {"nll": nll, "beta_nll": beta_nll}[self.options.objective](mean, log_variance, target)
         return (loss * batch["mask"]).sum() / (batch["mask"].sum() * target.shape[-1])
+
+    @torch.no_grad()
+    def fit_epistemic(self, batches: Iterable[dict[str, Tensor]], *, generator: torch.Generator) -> None:
+        """Fits the last layer's posterior to the valid tokens of training windows; nothing to do without one.
+
+        Args:
+            batches: as `loss` takes them.
+            generator: of the clusters of (s, a) that set the posterior's scale.
+        """
+        if self.laplace is None:
+            return
+        parts = []
+        for batch in batches:
+            batch = {name: column.to(self.head.weight.device) for name, column in batch.items()}
+            valid = batch["mask"].bool()
+            hidden, _ = self.encode(batch["observations"], batch["actions"], cached=False)
+            target = self.normaliser.target(batch["observations"], batch["next_observations"], batch["rewards"])
+            token = self.normaliser.token(batch["observations"], batch["actions"])
+            parts.append([column[valid] for column in (hidden.float(), target, token)])
+        hidden, target, token = (torch.cat(columns) for columns in zip(*parts, strict=True))
+        mean, log_variance, _ = self.heads(hidden)
+        self.laplace.fit(hidden, target, mean, log_variance.exp(), clusters(token, generator))
 
     def init(self, observations: Tensor, actions: Tensor, lengths: Tensor) -> TransformerState:
         """See `WorldModel.init`. One causal pass over the histories fills the cache."""
@@ -261,9 +294,13 @@ class EnvironmentTransformer(nn.Module):
         """Last hidden tokens (..., D) and current observations (..., S) to a `Prediction` in the data's units."""
         scale = self.normaliser.target_std
         mean, log_variance, epistemic_log_variance = self.heads(hidden)
-        variance = log_variance.exp()
+        epistemic, novelty = None, None
         if epistemic_log_variance is not None:
-            variance = variance + epistemic_log_variance.exp()
+            epistemic = epistemic_log_variance.exp()
+        elif self.laplace is not None:
+            leverage = self.laplace.leverage(hidden.float())
+            epistemic, novelty = self.laplace.variance(leverage), leverage / self.laplace.limit
+        variance = log_variance.exp() if epistemic is None else log_variance.exp() + epistemic
         value = mean
         if mode == "sample":
             value = mean + variance.sqrt() * torch.randn(
@@ -275,8 +312,9 @@ class EnvironmentTransformer(nn.Module):
             reward=outcome[..., -1],
             mean=self.normaliser.outcome(observation, mean),
             aleatoric=torch.exp(0.5 * log_variance) * scale,
-            epistemic=None if epistemic_log_variance is None else torch.exp(0.5 * epistemic_log_variance) * scale,
+            epistemic=None if epistemic is None else epistemic.sqrt() * scale,
             uncertainty=self._uncertainty(variance),
+            novelty=novelty,
             log_prob=-nll(mean, variance.log(), value) - scale.log().sum(),
         )
 

@@ -1,0 +1,113 @@
+"""Epistemic variance of a linear last layer: how far a token lies from those the model was trained on.
+
+A score of the outcome sees only the sum of aleatoric and epistemic variance, so no head can learn to tell them apart.
+The last layer, though, is a linear regression on the hidden token, and for that the posterior is known in closed form
+(the Laplace approximation, here exact up to the noise): it is wide where no training token pointed.
+"""
+
+import torch
+from torch import Tensor, nn
+
+RIDGE = 1e-2  # lambda: the prior's precision, in units of the (unweighted) noise
+CLUSTERS, LLOYD_ITERATIONS = 10, 20
+SCALES = torch.logspace(-4, 8, 121, dtype=torch.float64)  # candidates for c
+OUTSIDE = 0.999  # quantile of the training tokens' leverage beyond which a token counts as new
+
+
+class LastLayerLaplace(nn.Module):
+    """`S_eu(x) = c diag(R) q(x)` with the leverage `q = phi^T (Phi^T Phi + lambda I)^-1 phi`, phi = [hidden token, 1].
+
+    Until `fit` it knows no data and says zero.
+
+    Attributes:
+        root: (D + 1, D + 1) W with `W^T W = (Phi^T Phi + lambda I)^-1`, so that `q = |W phi|^2`.
+        residual: (K,) R, the variance of the training residuals of each output.
+        scale: c, by which residuals on clusters of data left out of the last layer exceed what q says.
+        limit: the 0.999 quantile of q over the training tokens.
+    """
+
+    root: Tensor
+    residual: Tensor
+    scale: Tensor
+    limit: Tensor
+
+    def __init__(self, width: int, outputs: int) -> None:
+        super().__init__()
+        self.register_buffer("root", torch.zeros(width + 1, width + 1))
+        self.register_buffer("residual", torch.zeros(outputs))
+        self.register_buffer("scale", torch.zeros(()))
+        self.register_buffer("limit", torch.ones(()))
+
+    def leverage(self, hidden: Tensor) -> Tensor:
+        """q of hidden tokens (..., D), (...), at least zero; at most one at a training token."""
+        return (_with_one(hidden).to(self.root.dtype) @ self.root.T).square().sum(-1)
+
+    def variance(self, leverage: Tensor) -> Tensor:
+        """S_eu (..., K), in the unit scale of the targets."""
+        return self.scale * leverage[..., None] * self.residual
+
+    def fit(self, hidden: Tensor, targets: Tensor, mean: Tensor, aleatoric: Tensor, groups: Tensor) -> None:
+        """Takes the posterior from N training tokens, and c from what happens to groups that it has not seen.
+
+        In-distribution data want no epistemic variance, so they cannot set its scale. For each group the last layer
+        is solved anew without it, and c maximises the likelihood of that group's residuals under
+        `N(0, S_au + c R q)`, q without the group too.
+
+        Args:
+            hidden: (N, D) last hidden tokens.
+            targets, mean, aleatoric: (N, K) what they should predict, what they do, with which variance; unit scale.
+            groups: (N,) int64, such as `clusters` gives.
+        """
+        tokens, targets, aleatoric = _with_one(hidden).double(), targets.double(), aleatoric.double()
+        residual = (targets - mean).square().mean(0)  # (K,)
+        gram, moment = tokens.T @ tokens, tokens.T @ targets
+        surprise = torch.zeros_like(SCALES)
+        for group in groups.unique():
+            mine = groups == group
+            own = tokens[mine]
+            root = _root(gram - own.T @ own)
+            solution = root.T @ (root @ (moment - own.T @ targets[mine]))  # (D + 1, K), ridge regression
+            squared = (targets[mine] - own @ solution).square()
+            spread = (own @ root.T).square().sum(-1)[:, None] * residual
+            surprise += _surprise(squared, aleatoric[mine], spread)
+        root = _root(gram)
+        self.root.copy_(root)
+        self.residual.copy_(residual)
+        self.scale.copy_(SCALES[surprise.argmin()])
+        self.limit.copy_(_quantile((tokens @ root.T).square().sum(-1), OUTSIDE))
+
+
+def clusters(points: Tensor, generator: torch.Generator, count: int = CLUSTERS) -> Tensor:
+    """(N,) int64: which of up to `count` k-means clusters (Lloyd's algorithm) each of the points (N, F) belongs to."""
+    start = torch.randperm(len(points), generator=generator)[:count].to(points.device)
+    centres = points[start]
+    nearest = torch.cdist(points, centres).argmin(1)
+    for _ in range(LLOYD_ITERATIONS):
+        sums = torch.zeros_like(centres).index_add_(0, nearest, points)
+        sizes = torch.bincount(nearest, minlength=len(centres)).clamp(min=1)
+        centres = sums / sizes[:, None]
+        nearest = torch.cdist(points, centres).argmin(1)
+    return nearest
+
+
+def _with_one(hidden: Tensor) -> Tensor:
+    return nn.functional.pad(hidden, (0, 1), value=1.0)
+
+
+def _root(gram: Tensor) -> Tensor:
+    """W (D, D) with `W^T W = (gram + lambda I)^-1`."""
+    identity = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
+    factor = torch.linalg.cholesky(gram + RIDGE * identity)
+    return torch.linalg.solve_triangular(factor, identity, upper=False)
+
+
+def _surprise(squared: Tensor, aleatoric: Tensor, spread: Tensor) -> Tensor:
+    """(C,) negative log-likelihood, up to a constant, of squared residuals (n, K) at each candidate of c."""
+    total = [aleatoric + scale * spread for scale in SCALES.to(squared.device)]
+    return torch.stack([0.5 * (squared / variance + variance.log()).sum() for variance in total]).to(SCALES.device)
+
+
+def _quantile(values: Tensor, share: float) -> Tensor:
+    """Of any number of values; `torch.quantile` takes 16 million."""
+    rank = max(1, round(share * len(values)))
+    return values.kthvalue(rank).values
