@@ -132,6 +132,7 @@ def imagine(
     tail: int = 0,
     novelty_limit: float | None = None,
     mode: Mode = "sample",
+    posterior: float = 0.0,
     generator: torch.Generator | None = None,
     batch_size: int = 4_096,
 ) -> Rollouts:
@@ -146,13 +147,14 @@ def imagine(
         novelty_limit: rollouts whose `Prediction.novelty` passes it end there, halted; None lets them go on.
         tail: further steps, with the policy's deterministic actions and mean predictions.
         mode: of `WorldModel.step`.
+        posterior: of `WorldModel.init`.
         generator: of the actions and of sampled next states.
         batch_size: rollouts imagined at a time.
     """
     parts: list[Rollouts] = []
     for begin in range(0, len(starts[0]), batch_size):
         chunk = tuple(part[begin : begin + batch_size] for part in starts)
-        state = model.init(*chunk)
+        state = model.init(*chunk, posterior=posterior, generator=generator)
         branch = torch.arange(begin, begin + len(chunk[0]), device=chunk[0].device)
         for step in range(horizon + tail):
             actor, how = (policy, mode) if step < horizon else (_Deterministic(policy), "mean")
@@ -204,6 +206,7 @@ class Imagination:
             terminated=self.terminated,
             novelty_limit=o.novelty_limit,
             mode=o.mode,
+            posterior=o.posterior,
             generator=generator,
         )
 

@@ -123,6 +123,8 @@ class ImaginationOptions:
             targets of the steps before them (model-based value expansion, Feinberg et al. 2018).
         history: real steps given to the model before the branch point.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
+        posterior: above zero each rollout runs in a world model of its own, drawn from the posterior of the last layer
+            with its deviation from the mean times this.
         buffer_size: imagined transitions kept; the oldest leave first.
         multi_step: temporal-difference targets run to the end of the imagined rollout, not one step.
         penalty: weight of the uncertainty u, in units of the data's reward standard deviation: `r - weight * std * u`.
@@ -142,6 +144,7 @@ class ImaginationOptions:
     tail: int = 50
     history: int = 4
     mode: Literal["mean", "sample"] = "sample"
+    posterior: float = 1.0
     buffer_size: int = 4_500
     multi_step: bool = True
     penalty: float = 0.0

@@ -33,7 +33,8 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("horizon", "buffer_size", "hidden", "critics", "sampled_actions", "episodes"), _COUNT),
     **dict.fromkeys(("trajectories", "n_step", "selection_steps"), _COUNT),
     **dict.fromkeys(
-        ("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty", "tail"), _NOT_NEGATIVE
+        ("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty", "tail", "posterior"),
+        _NOT_NEGATIVE,
     ),
     **dict.fromkeys(("cql_weight", "clone_weight", "warm_start", "selection_episodes"), _NOT_NEGATIVE),
     **dict.fromkeys(("learning_rate", "actor_learning_rate", "critic_learning_rate"), _POSITIVE),
@@ -135,7 +136,7 @@ def check_rules(params: Params) -> None:
     _check_model(params.train_model.model)
     _check_epochs("train_model", params.train_model)
     _check_policies(params)
-    _check_novelty(params)
+    _check_epistemic(params)
     _check_history("generate_rollouts", params.generate_rollouts.history, params.train_model.model)
 
 
@@ -202,17 +203,19 @@ def _check_policies(params: Params) -> None:
     _check_history("train_policy.et_cql.imagination", history, params.train_model.model)
 
 
-def _check_novelty(params: Params) -> None:
+def _check_epistemic(params: Params) -> None:
     imagination, epistemic = params.train_policy.et_cql.imagination, params.train_model.model.epistemic
     assert imagination is not None
-    for where, limit in (
-        ("generate_rollouts", params.generate_rollouts.novelty_limit),
-        ("train_policy.et_cql.imagination", imagination.novelty_limit),
+    for key, value in (
+        ("generate_rollouts.novelty_limit", params.generate_rollouts.novelty_limit),
+        ("train_policy.et_cql.imagination.novelty_limit", imagination.novelty_limit),
+        ("train_policy.et_cql.imagination.posterior", imagination.posterior or None),
     ):
-        if limit is not None and epistemic != "laplace":
+        if value is not None and epistemic != "laplace":
+            off = 0 if key.endswith("posterior") else "null"
             raise UserError(
-                f"{where}.novelty_limit is {limit} and train_model.model.epistemic is {epistemic}, which "
-                "knows no novelty: set the limit to null, or epistemic to laplace."
+                f"{key} is {value} and train_model.model.epistemic is {epistemic}, which has no posterior: set the one "
+                f"to {off}, or the other to laplace."
             )
 
 

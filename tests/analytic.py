@@ -22,7 +22,7 @@ class LinearWorld:
     observation_dim: int = 3
     action_dim: int = 1
 
-    def init(self, observations: Tensor, actions: Tensor, lengths: Tensor) -> Tensor:
+    def init(self, observations: Tensor, actions: Tensor, lengths: Tensor, **posterior) -> Tensor:
         return observations[torch.arange(len(lengths)), lengths - 1]
 
     def step(self, state: Tensor, action: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None):

@@ -54,6 +54,17 @@ def test_the_scale_is_what_left_out_groups_need():
     assert 0.5 < float(spread / (targets - targets.mean()).square().mean()) < 2.0
 
 
+def test_drawn_layers_vary_as_the_variance_says():
+    generator = torch.Generator().manual_seed(0)
+    hidden = torch.randn(500, 6, generator=generator).double()
+    laplace = fitted(hidden, hidden[:, :2])
+    drawn, query = laplace.draw(20_000, generator), torch.full((20_000, 6), 0.7).double()
+    deviation = laplace.deviation(query, drawn)
+    torch.testing.assert_close(deviation.var(0), laplace.variance(laplace.leverage(query[0])), rtol=0.05, atol=0)
+    again = laplace.deviation(query, drawn)
+    assert torch.equal(deviation, again) and not torch.equal(deviation[0], deviation[1])
+
+
 def test_until_it_is_fitted_it_says_zero():
     laplace = LastLayerLaplace(4, 2)
     assert not laplace.variance(laplace.leverage(torch.randn(3, 4))).any()

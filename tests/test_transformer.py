@@ -181,6 +181,32 @@ def test_uncertainty_and_density_take_in_the_fitted_posterior():
     torch.testing.assert_close(after.epistemic.square(), expected)
 
 
+def test_a_rollout_keeps_the_last_layer_it_drew():
+    model, (observations, actions) = make_model(), sequences(40, 6)
+    model.fit_epistemic([batch_of(observations, actions)], generator=torch.Generator().manual_seed(0))
+    start = torch.zeros(2, 1, S), torch.zeros(2, 0, A), torch.ones(2).long()
+
+    def trace(posterior: float) -> torch.Tensor:
+        state = model.init(*start, posterior=posterior, generator=torch.Generator().manual_seed(0))
+        steps = []
+        for t in range(4):
+            state, prediction = model.step(state, actions[:2, t])
+            state = model.observe(state, observations[:2, t])  # the same inputs whatever was drawn
+            steps.append(torch.cat([prediction.observation, prediction.reward[:, None]], -1) - prediction.mean)
+        return torch.stack(steps)
+
+    with torch.no_grad():
+        once, twice = trace(1.0), trace(2.0)
+        assert not trace(0.0).any()
+        torch.testing.assert_close(twice, 2 * once, atol=1e-5, rtol=1e-4)
+        assert not torch.allclose(once[:, 0], once[:, 1])
+        state = model.init(*start, posterior=1.0, generator=torch.Generator().manual_seed(0))
+        _, first = model.step(model.gather(state, torch.tensor([1])), actions[1:2, 0])
+        torch.testing.assert_close(first.observation - first.mean[:, :-1], once[0, 1:, :-1], atol=1e-5, rtol=1e-4)
+    with pytest.raises(UserError, match="has no posterior to draw from"):
+        make_model(epistemic="none").init(*start, posterior=1.0)
+
+
 def batch_of(observations: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
     B, T, _ = observations.shape
     return dict(

@@ -44,13 +44,27 @@ class WorldModel(Protocol):
     observation_dim: int
     action_dim: int
 
-    def init(self, observations: Tensor, actions: Tensor, lengths: Tensor) -> Any:
+    def init(
+        self,
+        observations: Tensor,
+        actions: Tensor,
+        lengths: Tensor,
+        *,
+        posterior: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> Any:
         """Starts B rollouts from histories.
 
         Args:
             observations: (B, T, S), right-padded; the last valid one has no action yet.
             actions: (B, T - 1, A), right-padded.
             lengths: (B,) number of valid observations of each row, 1 to T.
+            posterior: above zero each rollout runs, from end to end, in a model of its own, drawn from the posterior
+                with its deviation from the mean model times this (1: as it is).
+            generator: of those draws.
+
+        Raises:
+            UserError: `posterior` is above zero and the model has none.
         """
         ...
 

@@ -46,6 +46,16 @@ class LastLayerLaplace(nn.Module):
         """S_eu (..., K), in the unit scale of the targets."""
         return self.scale * leverage[..., None] * self.residual
 
+    def draw(self, count: int, generator: torch.Generator | None = None) -> Tensor:
+        """Last layers drawn from the posterior, as deviations from the trained one: (count, D + 1, K) on q's root."""
+        size = (count, len(self.root), len(self.residual))
+        return torch.randn(size, generator=generator, device=self.root.device, dtype=self.root.dtype)
+
+    def deviation(self, hidden: Tensor, drawn: Tensor) -> Tensor:
+        """What drawn last layers (B, D + 1, K) add to the mean at hidden tokens (B, D): (B, K), with variance S_eu."""
+        token = _with_one(hidden).to(self.root.dtype) @ self.root.T
+        return torch.einsum("bd,bdk->bk", token, drawn) * (self.scale * self.residual).sqrt()
+
     def fit(self, hidden: Tensor, targets: Tensor, mean: Tensor, aleatoric: Tensor, groups: Tensor) -> None:
         """Takes the posterior from N training tokens, and c from what happens to groups that it has not seen.
 

@@ -6,7 +6,7 @@ generation equals the uncached forward pass at every step, past the context leng
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
 
 import torch
@@ -108,12 +108,14 @@ class TransformerState:
         clock: position of the next token, the same for all rows (histories are right-aligned).
         first: (B,) position of each row's first token, or None where all rows began at 0.
         observation: (B, S) current observation.
+        drawn: (B, D + 1, S + 1) each row's last layer, drawn from the posterior; None where all use the trained one.
     """
 
     cache: list[tuple[Tensor, Tensor]]
     clock: int
     first: Tensor | None
     observation: Tensor
+    drawn: Tensor | None = None
 
 
 class EnvironmentTransformer(nn.Module):
@@ -238,7 +240,15 @@ class EnvironmentTransformer(nn.Module):
         mean, log_variance, _ = self.heads(hidden)
         self.laplace.fit(hidden, target, mean, log_variance.exp(), clusters(token, generator))
 
-    def init(self, observations: Tensor, actions: Tensor, lengths: Tensor) -> TransformerState:
+    def init(
+        self,
+        observations: Tensor,
+        actions: Tensor,
+        lengths: Tensor,
+        *,
+        posterior: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> TransformerState:
         """See `WorldModel.init`. One causal pass over the histories fills the cache."""
         B, T, _ = observations.shape
         current = observations[torch.arange(B, device=observations.device), lengths - 1]
@@ -255,7 +265,16 @@ class EnvironmentTransformer(nn.Module):
             for (keys, values), (k, v) in zip(empty, tokens, strict=True):
                 keys[:, :, slots % context] = k[:, :, slots].float()
                 values[:, :, slots % context] = v[:, :, slots].float()
-        return TransformerState(empty, T - 1, first, current)
+        drawn = posterior * self._posterior().draw(B, generator) if posterior > 0 else None
+        return TransformerState(empty, T - 1, first, current, drawn)
+
+    def _posterior(self) -> LastLayerLaplace:
+        if self.laplace is None:
+            raise UserError(
+                "This world model has no posterior to draw from, since it was trained with epistemic: "
+                f"{self.options.epistemic}: set posterior to 0, or train one with epistemic: laplace."
+            )
+        return self.laplace
 
     def step(
         self,
@@ -277,8 +296,8 @@ class EnvironmentTransformer(nn.Module):
             cache.append((keys, values))
             q, keys, values = q.float(), keys[:, :, :filled], values[:, :, :filled]
             x = block.finish(x, block.attention.attend(q, keys, values, mask))
-        prediction = self.predict(self.norm(x)[:, 0], state.observation, mode=mode, generator=generator)
-        return TransformerState(cache, state.clock + 1, state.first, prediction.observation), prediction
+        prediction = self.predict(self.norm(x)[:, 0], state.observation, state.drawn, mode=mode, generator=generator)
+        return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
 
     def _visible(self, state: TransformerState, filled: int) -> Tensor | None:
         """(B, 1, 1, filled) slots that hold a token of the row itself, or None where all do."""
@@ -289,9 +308,18 @@ class EnvironmentTransformer(nn.Module):
         return (positions >= state.first[:, None])[:, None, None]
 
     def predict(
-        self, hidden: Tensor, observation: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None
+        self,
+        hidden: Tensor,
+        observation: Tensor,
+        drawn: Tensor | None = None,
+        *,
+        mode: Mode = "mean",
+        generator: torch.Generator | None = None,
     ) -> Prediction:
-        """Last hidden tokens (..., D) and current observations (..., S) to a `Prediction` in the data's units."""
+        """Last hidden tokens (..., D) and current observations (..., S) to a `Prediction` in the data's units.
+
+        With drawn last layers (B, D + 1, S + 1) outcomes follow those, and differ by aleatoric noise alone.
+        """
         scale = self.normaliser.target_std
         mean, log_variance, epistemic_log_variance = self.heads(hidden)
         epistemic, novelty = None, None
@@ -301,11 +329,12 @@ class EnvironmentTransformer(nn.Module):
             leverage = self.laplace.leverage(hidden.float())
             epistemic, novelty = self.laplace.variance(leverage), leverage / self.laplace.limit
         variance = log_variance.exp() if epistemic is None else log_variance.exp() + epistemic
-        value = mean
+        value, spread = mean, variance
+        if drawn is not None:
+            value, spread = mean + self._posterior().deviation(hidden.float(), drawn), log_variance.exp()
         if mode == "sample":
-            value = mean + variance.sqrt() * torch.randn(
-                mean.shape, generator=generator, device=mean.device, dtype=mean.dtype
-            )
+            noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
+            value = value + spread.sqrt() * noise
         outcome = self.normaliser.outcome(observation, value)
         return Prediction(
             observation=outcome[..., :-1],
@@ -327,7 +356,7 @@ class EnvironmentTransformer(nn.Module):
 
     def observe(self, state: TransformerState, observation: Tensor) -> TransformerState:
         """See `WorldModel.observe`."""
-        return TransformerState(state.cache, state.clock, state.first, observation)
+        return replace(state, observation=observation)
 
     def current(self, state: TransformerState) -> Tensor:
         """See `WorldModel.current`."""
@@ -343,7 +372,8 @@ class EnvironmentTransformer(nn.Module):
         filled = min(state.clock, self.options.context)
         cache = [(_pick(keys, index, filled), _pick(values, index, filled)) for keys, values in state.cache]
         first = None if state.first is None else state.first[index]
-        return TransformerState(cache, state.clock, first, state.observation[index])
+        drawn = None if state.drawn is None else state.drawn[index]
+        return TransformerState(cache, state.clock, first, state.observation[index], drawn)
 
 
 def _initialise(module: nn.Module) -> None:
