@@ -146,7 +146,8 @@ def one_step(model: EnvironmentTransformer) -> Prediction:
 def test_epistemic_variance_comes_from_where_the_options_say():
     assert one_step(make_model(epistemic="none")).epistemic is None
     unfitted, head = one_step(make_model()), one_step(make_model(epistemic="head"))
-    assert unfitted.epistemic is not None and not unfitted.epistemic.any() and not unfitted.novelty.any()
+    assert unfitted.epistemic is not None and unfitted.novelty is not None
+    assert not unfitted.epistemic.any() and not unfitted.novelty.any()
     assert head.epistemic is not None and head.epistemic.all() and head.novelty is None
 
 
