@@ -171,11 +171,12 @@ def _in_words(task: Task, series: Series) -> tuple[str, str]:
     phases = plan(task, FULL, series)
     scores = [task.robot.normalised_score(phase.mean_return) for phase in phases if phase.mean_return is not None]
     after = [f"{phase.steps:,}" for phase in phases if phase.steps]
-    if not scores:
+    if task.tier == "random":
         return "uniform random actions", ""
-    if len(phases) <= 2:
-        words = f"snapshot{'s' if len(after) > 1 else ''} after {' and '.join(after)} steps, half each"
-        return words.removesuffix(", half each") if len(after) == 1 else words, _range(scores)
+    if task.tier == "medium":
+        return f"snapshot after {after[0]} steps", _range(scores)
+    if task.tier == "medium-expert":
+        return f"snapshots after {after[0]} and {after[1]} steps, half each", _range(scores)
     return f"random warm-up, then {len(after)} snapshots up to {after[-1]} steps", _range(scores)
 
 

@@ -286,3 +286,5 @@ def test_a_built_wheel_brings_the_project_template(tmp_path: Path) -> None:
     assert (tmp_path / "new/notebooks/report.ipynb").is_file()
     call("envtf", "download", "--quiet", cwd=tmp_path / "new")
     assert (tmp_path / "new/data/dataset.h5").is_file()
+    call("envtf", "zoo", "build", "ant-medium", "--transitions", "200", "--workers", "1", "--quiet")
+    assert "Ant-v5" in (tmp_path / "data/zoo/ant-medium.md").read_text()
