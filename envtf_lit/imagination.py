@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.loaders import Store, WeightedRows
 from envtf_lit.errors import UserError
 from envtf_lit.params import ImaginationOptions
 from envtf_lit.policy import Policy, TanhGaussianActor
@@ -88,23 +89,21 @@ class BranchPoints:
     def __init__(
         self, dataset: OfflineDataset, device: torch.device | str = "cpu", weights: Tensor | None = None
     ) -> None:
-        if weights is None:
-            weights = torch.ones(len(dataset))
-        self.cumulative = (weights.double().cumsum(0) / weights.double().sum()).to(device)
-        self.observations = torch.as_tensor(dataset.observations, device=device)
-        self.actions = torch.as_tensor(dataset.actions, device=device)
+        self.rows = WeightedRows(torch.ones(len(dataset)) if weights is None else weights, device)
+        self.observations = Store(dataset, ("observations",), device)
+        self.actions = Store(dataset, ("actions",), device)
         self.starts = torch.as_tensor(dataset.episode_starts[dataset.episode_index], device=device)
 
     def draw(self, count: int, history: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Rows, each with up to `history` steps before it: the arguments of `WorldModel.init`."""
         device = self.starts.device
-        uniform = torch.rand(count, generator=generator, device=device, dtype=torch.float64)
-        row = torch.searchsorted(self.cumulative, uniform).clamp(max=len(self.starts) - 1)
+        row = self.rows.draw((count,), generator)
         start = torch.maximum(row - history, self.starts[row])
         index = torch.minimum(
             start[:, None] + torch.arange(history + 1, device=device), row[:, None]
         )  # (B, history + 1)
-        return self.observations[index], self.actions[index[:, :-1]], row - start + 1
+        histories = self.observations[index]["observations"], self.actions[index[:, :-1]]["actions"]
+        return *histories, row - start + 1
 
 
 class NoisyPolicy:

@@ -12,7 +12,6 @@ from typing import Any, Literal
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
-from torch import Tensor
 
 from envtf_lit.params import Precision
 from envtf_lit.storage import replacing
@@ -123,9 +122,3 @@ def fit(
 def autocast(device: torch.device, precision: Precision) -> torch.autocast:
     """bf16 matrix products where the parameters ask for them."""
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
-
-
-def observation_scale(observations: Tensor, floor: float = 1e-3) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation (S,) of observations (N, S) for a policy's inputs; the std is at least `floor`."""
-    std, mean = torch.std_mean(observations.double(), dim=0, correction=0)
-    return mean.float(), std.clamp(min=floor).float()

@@ -101,7 +101,7 @@ def test_without_next_observations_the_last_row_of_each_episode_goes(tmp_path: P
 def test_actions_a_rounding_error_outside_are_clipped(tmp_path: Path, ending: str):
     content = columns()
     content["actions"][2, 1] = 1.000005
-    assert load_dataset(write(tmp_path / f"in{ending}", content)).actions.max() == 1
+    assert np.max(load_dataset(write(tmp_path / f"in{ending}", content)).actions) == 1
 
 
 def test_stored_action_limits_are_used(tmp_path: Path, ending: str):
@@ -142,7 +142,7 @@ def test_large_columns_are_written_and_read_in_blocks(tmp_path: Path, ending: st
     content = columns() | {"observations": columns()["observations"].astype(np.float64)}
     whole = load_dataset(write(tmp_path / f"in{ending}", content))
     save_dataset(whole, tmp_path / f"whole{ending}")
-    monkeypatch.setattr("envtf_lit.data.validation.BLOCK_BYTES", 100)
+    monkeypatch.setattr("envtf_lit.data.columns.BLOCK_BYTES", 100)
     parts = load_dataset(tmp_path / f"in{ending}")
     assert_equal(parts, whole)
     save_dataset(parts, tmp_path / f"parts{ending}")

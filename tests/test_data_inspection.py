@@ -62,7 +62,7 @@ def test_an_episode_end_without_a_flag_is_seen_as_a_gap():
 
 def test_constant_dimensions_and_rewards():
     dataset = walker_dataset()
-    observations, actions = dataset.observations.copy(), dataset.actions.copy()
+    observations, actions = np.array(dataset.observations), np.array(dataset.actions)
     observations[:, [2, 5]], actions[:, 1] = 3.0, 0.0
     text = said(
         dataset, observations=observations, next_observations=observations, actions=actions, rewards=np.ones(240)
@@ -74,7 +74,7 @@ def test_constant_dimensions_and_rewards():
 
 def test_huge_values():
     dataset = walker_dataset()
-    observations = dataset.observations.copy()
+    observations = np.array(dataset.observations)
     observations[7, 4] = -3e38
     text = said(dataset, observations=observations, rewards=1e9 * dataset.rewards)
     assert "'observations' reach a magnitude of 3e+38 in dimension 4" in text

@@ -118,7 +118,7 @@ def test_a_set_without_an_environment_says_so() -> None:
 
 def test_episodes_are_split_where_a_next_observation_is_not_the_following_row() -> None:
     dataset = make_dataset()
-    dataset.next_observations[6] += 1  # within the third episode, after its second step
+    np.asarray(dataset.next_observations)[6] += 1  # within the third episode, after its second step
     assert write_minari(dataset, "split-v0") == 1
     again = read_minari("split-v0")
     assert again.episode_starts.tolist() == [0, 3, 5, 7]

@@ -203,5 +203,5 @@ def test_the_arrays_given_stay_as_they_are():
     before = {name: values.copy() for name, values in content.items()}
     dataset, _ = find(content)
     assert dataset is not None
-    assert dataset.actions.max() == 1
+    assert np.max(dataset.actions) == 1
     assert all(np.array_equal(content[name], before[name]) for name in before)

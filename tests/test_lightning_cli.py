@@ -73,7 +73,7 @@ def test_an_agents_validation_against_plain_numbers(folder: Path) -> None:
     agent = CQL(data.observation_dim, data.action_dim, PolicyOptions(hidden=(8,), discount=0.9))
     trainer = L.Trainer(logger=False, enable_progress_bar=False, enable_model_summary=False)
     (logged,) = trainer.validate(agent, data, verbose=False)
-    rows = Transitions(data.dataset, discount=0.9).columns
+    rows = Transitions(data.dataset, discount=0.9)[torch.arange(len(data.dataset))]
     scale = rows["returns"].std(correction=0).item()  # Q counts in this unit, the metrics in the data's
     q = scale * agent.critics(rows["observations"], rows["actions"]).min(0).values.detach().numpy()
     returns, action = rows["returns"].numpy(), agent.average_actor.act(rows["observations"]).numpy()
@@ -110,7 +110,7 @@ def test_agent_fit_publishes_a_policy_with_the_datas_scale_and_limits(
     assert ".envtf/published" in capsys.readouterr().out
     policy, dataset = load_policy(".envtf/published"), TransitionData("data/dataset.h5").dataset
     assert policy.action_low.tolist() == [-2.0] * 3 and policy.action_high.tolist() == [2.0] * 3
-    np.testing.assert_allclose(policy.observation_mean, dataset.observations.mean(0), atol=1e-6)
+    np.testing.assert_allclose(policy.observation_mean, np.asarray(dataset.observations).mean(0), atol=1e-6)
     (checkpoint,) = Path(".envtf").rglob("*.ckpt")
     saved = torch.load(checkpoint, weights_only=True)
     assert saved["hyper_parameters"]["action_low"] == [-2.0] * 3

@@ -55,7 +55,7 @@ def test_one_step_transitions_tell_terminated_from_truncated():
 
 
 def test_n_step_transitions_against_hand_computed_sums():
-    columns = Transitions(make_dataset(), discount=0.5, n_step=3).columns
+    columns = Transitions(make_dataset(), discount=0.5, n_step=3)[torch.arange(9)]
     # row 0: 0 + 1/2 + 2/4, terminated there; row 3: one truncated step; row 4: 4 + 5/2 + 6/4, then s_7
     assert columns["rewards"][[0, 3, 4]].tolist() == [1.0, 3.0, 8.0]
     assert columns["discounts"][[0, 3, 4]].tolist() == [0.0, 0.5, 0.125]

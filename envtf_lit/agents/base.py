@@ -17,7 +17,6 @@ from envtf_lit.imagination import Imagination, Rollouts
 from envtf_lit.params import ImaginationOptions, PolicyOptions
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.storage import load_weights
-from envtf_lit.training import observation_scale
 
 Batch = dict[str, Tensor]
 
@@ -102,7 +101,7 @@ class OfflineAgent(L.LightningModule, ABC):
     def setup(self, stage: str) -> None:
         """Takes scales from the dataset (the actor's, with its weights, from `init_from`) and the first rollouts."""
         data: TransitionData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
-        self.normalise_with(*observation_scale(torch.as_tensor(data.dataset.observations)))
+        self.normalise_with(*data.dataset.observation_scale())
         if self.init_from is not None:
             for actor in (self.actor, self.average_actor):
                 load_weights(actor, f"{self.init_from}/weights.safetensors")

@@ -11,7 +11,7 @@ from torch import Tensor
 from envtf_lit.data.loaders import TransitionData
 from envtf_lit.params import GenerateRolloutsOptions, Precision
 from envtf_lit.policy import TanhGaussianActor
-from envtf_lit.training import Curves, fit, observation_scale
+from envtf_lit.training import Curves, fit
 
 CLONE_STEPS_PER_EPOCH = 10  # Lightning steps of 10 updates each
 
@@ -63,7 +63,7 @@ def clone_behaviour(
         action_low=data.action_low,
         action_high=data.action_high,
     )
-    mean, std = observation_scale(torch.as_tensor(data.dataset.observations))
+    mean, std = data.dataset.observation_scale()
     actor.observation_mean.copy_(mean)
     actor.observation_std.copy_(std)
     updates_per_epoch = CLONE_STEPS_PER_EPOCH * data.updates_per_step

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from envtf_lit.data.columns import blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.fetch import RemoteFile, fetch, sha256
 from envtf_lit.data.formats import open_raw
-from envtf_lit.data.validation import blocks, build_dataset
+from envtf_lit.data.validation import build_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.tasks import Robot, Task
 

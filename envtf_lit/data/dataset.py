@@ -3,9 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from envtf_lit.data.columns import Column, column_blocks, moments, take
 from envtf_lit.errors import UserError
 
 COLUMNS = ("observations", "actions", "rewards", "next_observations", "terminated", "truncated")
@@ -20,7 +24,7 @@ class OfflineDataset:
     episode ends at a row where either is set, or at the last row.
 
     Attributes:
-        observations: (N, S) float32.
+        observations: (N, S) float32; of a large file, like the other wide columns, a `FileRows` that is read by rows.
         actions: (N, A) float32.
         rewards: (N,) float32.
         next_observations: (N, S) float32.
@@ -30,10 +34,10 @@ class OfflineDataset:
         action_low, action_high: (A,) float32, the action space.
     """
 
-    observations: np.ndarray
-    actions: np.ndarray
+    observations: Column
+    actions: Column
     rewards: np.ndarray
-    next_observations: np.ndarray
+    next_observations: Column
     terminated: np.ndarray
     truncated: np.ndarray
     episode_starts: np.ndarray
@@ -72,6 +76,11 @@ class OfflineDataset:
         """(N,) the episode each row belongs to."""
         return np.repeat(np.arange(len(self.episode_starts)), self.episode_lengths)
 
+    def observation_scale(self, floor: float = 1e-3) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation (S,) float32 for a policy's inputs; the std is at least `floor`."""
+        mean, std = moments(torch.as_tensor(self.observations[block]) for block in column_blocks(self.observations))
+        return mean.float(), std.clamp(min=floor).float()
+
     def select(self, episodes: Sequence[int] | np.ndarray) -> "OfflineDataset":
         """The dataset of these episodes, in the order given."""
         episodes = np.asarray(episodes, dtype=np.int64)
@@ -80,7 +89,7 @@ class OfflineDataset:
         lengths = self.episode_lengths[episodes]
         starts = np.concatenate([[0], np.cumsum(lengths)[:-1]])
         rows = np.arange(lengths.sum()) + np.repeat(self.episode_starts[episodes] - starts, lengths)
-        columns = {name: getattr(self, name)[rows] for name in COLUMNS}
+        columns: dict[str, Any] = {name: take(getattr(self, name), rows) for name in COLUMNS}
         return OfflineDataset(
             **columns,
             episode_starts=starts,

@@ -5,6 +5,7 @@ filters but HDF5's own, no sizes that the file itself cannot hold.
 """
 
 import math
+import struct
 import warnings
 import zipfile
 from collections.abc import Iterable, Iterator
@@ -16,8 +17,9 @@ from typing import Any
 import h5py
 import numpy as np
 
+from envtf_lit.data.columns import Column, FileRows, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.validation import Finding, blocks, build_dataset
+from envtf_lit.data.validation import Finding, build_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.storage import replacing
 
@@ -37,6 +39,8 @@ HDF5_FILTERS = {1, 2, 3, 4, 5, 6, 32000}  # gzip, shuffle, fletcher32, szip, nbi
 # no log of numbers shrinks to a 200th: a file that declares more than this, and more than that, is damaged or a trap
 BOMB_RATIO, BOMB_BYTES = 200, 256 << 20
 LARGEST_ATTRIBUTE = 1 << 20  # bytes
+# of a file with more than this, wide columns stay there and are read as they are needed
+RESIDENT_BYTES = 256 << 20
 
 
 @dataclass
@@ -130,19 +134,25 @@ def is_hdf5(path: Path) -> bool:
     return ending in HDF5_ENDINGS
 
 
-def _write_hdf5(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, Any]) -> None:
+def _write_hdf5(path: Path, arrays: dict[str, Column], attributes: dict[str, Any]) -> None:
     # through Python's own file: a full disk is then an OSError with its number, and early
     with path.open("w+b") as stream, h5py.File(stream, "w") as file:
         for name, array in arrays.items():
             column = file.create_dataset(name, array.shape, array.dtype, track_times=False)
-            for block in blocks(len(array), array[:1].nbytes):
+            for block in column_blocks(array):
                 column[block] = array[block]
         file.attrs.update(attributes)
 
 
-def _write_npz(path: Path, arrays: dict[str, np.ndarray], attributes: dict[str, Any]) -> None:
-    with path.open("wb") as stream:
-        np.savez(stream, allow_pickle=False, **arrays, **attributes)  # numpy dates every member 1980
+def _write_npz(path: Path, arrays: dict[str, Column], attributes: dict[str, Any]) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in (arrays | {name: np.asarray(value) for name, value in attributes.items()}).items():
+            member = zipfile.ZipInfo(f"{name}.npy")  # of 1980, whatever the clock says
+            with archive.open(member, "w", force_zip64=True) as stream:
+                layout = {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False}
+                np.lib.format.write_array_header_1_0(stream, layout | {"shape": array.shape})
+                for block in column_blocks(array) if array.shape else [...]:
+                    stream.write(np.ascontiguousarray(array[block]).tobytes())
 
 
 def _find_names(present: Iterable[str]) -> tuple[dict[str, str], list[str]]:
@@ -185,6 +195,8 @@ def _open_hdf5(path: Path) -> tuple[h5py.File, Raw]:
             else:
                 raw.columns[column] = item
         check_size(path, {name: hdf5_bytes(item) for name, item in raw.columns.items()})
+        if path.stat().st_size > RESIDENT_BYTES:
+            raw.columns |= {name: rows for name, item in raw.columns.items() if (rows := _hdf5_rows(path, item))}
         for name in ATTRIBUTES:
             if name in file.attrs:
                 raw.attributes[name] = _hdf5_attribute(file, name)
@@ -217,6 +229,15 @@ def _plain_hdf5(file: h5py.File, name: str) -> h5py.Dataset | None:
     return item if isinstance(item, h5py.Dataset) and item.shape is not None and item.dtype.kind in "biuf" else None
 
 
+def _hdf5_rows(path: Path, item: h5py.Dataset) -> FileRows | None:
+    """The same array outside of HDF5, if it lies in one piece in the form that we keep it in."""
+    offset = item.id.get_offset()
+    plain = item.chunks is None and item.dtype == np.dtype("<f4") and item.file.userblock_size == 0
+    if not plain or offset is None or item.ndim != 2 or offset + hdf5_bytes(item) > path.stat().st_size:
+        return None
+    return FileRows(path, offset, item.shape)
+
+
 def _hdf5_attribute(file: h5py.File, name: str) -> Any:
     attribute = file.attrs.get_id(name)
     plain = attribute.dtype.kind in "biufSU" or h5py.check_string_dtype(attribute.dtype) is not None
@@ -240,7 +261,7 @@ def _open_npz(path: Path) -> tuple[zipfile.ZipFile, Raw]:
         declared = {name: archive.getinfo(members[name]).file_size for name in names.values()}
         check_size(path, declared)
         for column, name in names.items():
-            _read_member(raw, archive, members[name], column)
+            _read_member(raw, path, archive, members[name], column)
         for name in ATTRIBUTES:
             if name in members and archive.getinfo(members[name]).file_size <= LARGEST_ATTRIBUTE:
                 with archive.open(members[name]) as stream:
@@ -251,20 +272,37 @@ def _open_npz(path: Path) -> tuple[zipfile.ZipFile, Raw]:
     return archive, raw
 
 
-def _read_member(raw: Raw, archive: zipfile.ZipFile, member: str, column: str) -> None:
+def _read_member(raw: Raw, path: Path, archive: zipfile.ZipFile, member: str, column: str) -> None:
     try:
         with archive.open(member) as stream:
-            shape, _, dtype = _read_header(stream)
+            shape, columns_first, dtype = _read_header(stream)
+            begin = stream.tell()
             if dtype.kind not in "biuf":
                 raw.broken[column] = Finding("error", f"{column!r} holds {dtype} values", "store plain numbers")
                 return
-            if math.prod(shape) * dtype.itemsize > archive.getinfo(member).file_size:
+            if math.prod(shape) * dtype.itemsize > archive.getinfo(member).file_size - begin:
                 raise ValueError(f"it declares shape {shape} and holds less")
+            plain = dtype == np.dtype("<f4") and len(shape) == 2 and not columns_first and 0 not in shape
+            if plain and path.stat().st_size > RESIDENT_BYTES and (start := _stored_at(path, archive, member)):
+                raw.columns[column] = FileRows(path, start + begin, (shape[0], shape[1]))
+                return
         with archive.open(member) as stream:
             raw.columns[column] = np.lib.format.read_array(stream, allow_pickle=False)
     except Exception as error:  # whatever a decoder of foreign bytes raises
         reason = " ".join(str(error).split())[:200]
         raw.broken[column] = Finding("error", f"{column!r} is damaged ({reason})", "fetch or write the file anew")
+
+
+def _stored_at(path: Path, archive: zipfile.ZipFile, member: str) -> int | None:
+    """Where in the file a member begins, None if it is compressed."""
+    info = archive.getinfo(member)
+    if info.compress_type != zipfile.ZIP_STORED:
+        return None
+    with path.open("rb") as file:
+        file.seek(info.header_offset + 26)
+        name, extra = struct.unpack("<HH", file.read(4))  # their lengths
+    start = info.header_offset + 30 + name + extra
+    return start if start + info.file_size <= path.stat().st_size else None
 
 
 def _read_header(stream: Any) -> tuple[tuple[int, ...], bool, np.dtype]:

@@ -10,9 +10,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from envtf_lit.data.columns import blocks, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import open_raw
-from envtf_lit.data.validation import Finding, blocks, examine
+from envtf_lit.data.validation import Finding, examine
 from envtf_lit.errors import UserError
 from envtf_lit.tasks import get_task
 
@@ -89,7 +90,7 @@ def _describe(name: str, values: Any) -> Column:
     low, high = np.inf, -np.inf
     if values.dtype.kind in "biuf" and values.shape:
         try:
-            for block in blocks(len(values), values.dtype.itemsize * int(np.prod(values.shape[1:]))):
+            for block in column_blocks(values):
                 part = np.asarray(values[block])
                 finite = part[np.isfinite(part)]
                 if finite.size:
@@ -149,7 +150,7 @@ def _seams(dataset: OfflineDataset) -> Iterator[Finding]:
     last = np.zeros(len(dataset), bool)
     last[dataset.episode_ends - 1] = True
     gaps, first = 0, -1
-    for block in blocks(len(dataset) - 1, dataset.observations[:1].nbytes):
+    for block in blocks(len(dataset) - 1, 4 * dataset.observation_dim):
         after = slice(block.start + 1, block.stop + 1)
         with np.errstate(over="ignore"):  # infinitely far is far
             jump = (np.abs(dataset.next_observations[block] - dataset.observations[after]) > scale).any(axis=1)
@@ -164,9 +165,12 @@ def _seams(dataset: OfflineDataset) -> Iterator[Finding]:
 def _ranges(dataset: OfflineDataset) -> Iterator[Finding]:
     """Dimensions that say nothing, and values that no quantity has."""
     for name in ("observations", "actions", "rewards"):
-        column = getattr(dataset, name).reshape(len(dataset), -1)
-        parts = [column[block] for block in blocks(len(column), column[:1].nbytes)]
-        low, high = (f([f(part, axis=0) for part in parts], axis=0).astype(np.float64) for f in (np.min, np.max))
+        column = getattr(dataset, name)
+        low = np.full(column[:1].size, np.inf)
+        high = -low
+        for block in column_blocks(column):
+            part = column[block].reshape(block.stop - block.start, -1).astype(np.float64)
+            low, high = np.minimum(low, part.min(axis=0)), np.maximum(high, part.max(axis=0))
         dead = np.flatnonzero(high - low < CONSTANT)
         if dead.size and name != "rewards":
             what = f"{dead.size} of {len(low)} dimensions of {name!r} are constant ({_listed(dead)})"
@@ -182,7 +186,7 @@ def _duplicates(dataset: OfflineDataset) -> Iterator[Finding]:
     codes = np.concatenate(
         [
             _codes(np.concatenate([dataset.observations[block], dataset.actions[block]], axis=1))
-            for block in blocks(len(dataset), dataset.observations[:1].nbytes + dataset.actions[:1].nbytes)
+            for block in column_blocks(dataset.observations)
         ]
     )
     again = len(codes) - len(np.unique(codes))

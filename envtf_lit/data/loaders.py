@@ -1,7 +1,8 @@
-"""Batches for Lightning: the dataset lives on the device as tensors, and a batch is a draw of row numbers.
+"""Batches for Lightning: a batch is a draw of row numbers, and the rows come from where they lie.
 
-Every epoch draws from a generator seeded by (seed, epoch), so a run resumed at an epoch's start sees the same rows as
-one that was never interrupted.
+Columns lie on the device as tensors if they fit there; those of a large file stay in it. The batches are the same to
+the bit. Every epoch draws from a generator seeded by (seed, epoch), so a run resumed at an epoch's start sees the same
+rows as one that was never interrupted.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from envtf_lit.data.columns import Column, FileRows, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import load_dataset
 
@@ -21,6 +23,23 @@ def epoch_generator(seed: int, epoch: int, stream: str) -> torch.Generator:
     """An independent random stream for each (seed, epoch, purpose)."""
     words = np.random.SeedSequence([seed, epoch, *stream.encode()]).generate_state(2, np.uint32)
     return torch.Generator().manual_seed(int(words[0]) << 32 | int(words[1]))
+
+
+class WeightedRows:
+    """Draws row numbers with given chances: a table of cumulative chances, searched.
+
+    Args:
+        weights: (N,) chances of each row, up to a factor.
+        device: where the table lies and the numbers are drawn.
+    """
+
+    def __init__(self, weights: Tensor, device: torch.device | str = "cpu") -> None:
+        self.cumulative = (weights.double().cumsum(0) / weights.double().sum()).to(device)  # (N,)
+
+    def draw(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        """Row numbers of this shape; `generator` is on the table's device."""
+        uniform = torch.rand(shape, generator=generator, device=self.cumulative.device, dtype=torch.float64)
+        return torch.searchsorted(self.cumulative, uniform).clamp(max=len(self.cumulative) - 1)
 
 
 class DrawSampler(Sampler[Tensor]):
@@ -38,7 +57,7 @@ class DrawSampler(Sampler[Tensor]):
         self, rows: int, shape: tuple[int, ...], batches: int, *, seed: int, weights: Tensor | None = None
     ) -> None:
         self.rows, self.shape, self.batches, self.seed, self.epoch = rows, shape, batches, seed, 0
-        self.cumulative = None if weights is None else weights.double().cumsum(0) / weights.double().sum()
+        self.weighted = None if weights is None else WeightedRows(weights)
 
     def set_epoch(self, epoch: int) -> None:
         """Called by Lightning before each epoch."""
@@ -50,11 +69,10 @@ class DrawSampler(Sampler[Tensor]):
     def __iter__(self) -> Iterator[Tensor]:
         generator = epoch_generator(self.seed, self.epoch, "rows")
         for _ in range(self.batches):
-            if self.cumulative is None:
+            if self.weighted is None:
                 yield torch.randint(self.rows, self.shape, generator=generator)
             else:
-                uniform = torch.rand(self.shape, generator=generator, dtype=torch.float64)
-                yield torch.searchsorted(self.cumulative, uniform).clamp(max=self.rows - 1)
+                yield self.weighted.draw(self.shape, generator)
 
 
 def return_weights(dataset: OfflineDataset, temperature: float) -> Tensor:
@@ -67,6 +85,48 @@ def return_weights(dataset: OfflineDataset, temperature: float) -> Tensor:
     return torch.as_tensor(np.exp((scaled - 1.0) / temperature)[dataset.episode_index])
 
 
+class Store:
+    """Columns of a dataset, to gather rows from.
+
+    Args:
+        dataset: whose columns.
+        names: of the columns.
+        device: where gathered rows go, and where the columns themselves go if they fit into half of its free memory.
+            On the CPU all columns stay where they are, which for a large dataset is its file.
+    """
+
+    def __init__(self, dataset: OfflineDataset, names: Iterable[str], device: torch.device | str = "cpu") -> None:
+        self.device = torch.device(device)
+        columns: dict[str, Column] = {name: getattr(dataset, name) for name in names}
+        resident = _fits(sum(column.nbytes for column in columns.values()), self.device)
+        self.columns = {name: _place(column, self.device, resident) for name, column in columns.items()}
+
+    def __getitem__(self, rows: Tensor) -> dict[str, Tensor]:
+        """Row numbers (...) on any device to each column's rows (..., D) on the store's."""
+        return {name: self._gather(column, rows) for name, column in self.columns.items()}
+
+    def _gather(self, column: Tensor | FileRows, rows: Tensor) -> Tensor:
+        if isinstance(column, FileRows):
+            return torch.from_numpy(column[rows.cpu().numpy()]).to(self.device)
+        return column[rows.to(column.device)].to(self.device)
+
+
+def _fits(size: int, device: torch.device) -> bool:
+    if device.type == "cpu":
+        return False
+    memory = getattr(torch.get_device_module(device), "mem_get_info", None)
+    return memory is not None and size < memory(device)[0] // 2
+
+
+def _place(column: Column, device: torch.device, resident: bool) -> Tensor | FileRows:
+    if not resident:
+        return column if isinstance(column, FileRows) else torch.as_tensor(column)
+    placed = torch.empty(column.shape, dtype=torch.as_tensor(column[:0]).dtype, device=device)
+    for block in column_blocks(column):
+        placed[block] = torch.as_tensor(column[block]).to(device)
+    return placed
+
+
 class Windows(Dataset[dict[str, Tensor]]):
     """Windows of up to T consecutive steps that never cross an episode.
 
@@ -75,36 +135,34 @@ class Windows(Dataset[dict[str, Tensor]]):
     sticks out on either side is cut, and the rest is moved to the left and padded on the right.
     """
 
-    def __init__(self, dataset: OfflineDataset, length: int) -> None:
+    def __init__(self, dataset: OfflineDataset, length: int, device: torch.device | str = "cpu") -> None:
         self.length = length
-        self.columns = {
-            name: torch.as_tensor(getattr(dataset, name))
-            for name in ("observations", "actions", "rewards", "next_observations")
-        }
-        self.starts = torch.as_tensor(dataset.episode_starts)  # (E,)
-        self.ends = torch.as_tensor(dataset.episode_ends)
+        self.store = Store(dataset, ("observations", "actions", "rewards", "next_observations"), device)
+        self.starts = torch.as_tensor(dataset.episode_starts, device=device)  # (E,)
+        self.ends = torch.as_tensor(dataset.episode_ends, device=device)
         self.offsets = torch.cumsum(self.ends - self.starts + length - 1, 0)  # (E,) windows up to each episode's last
 
     def __len__(self) -> int:
         return int(self.offsets[-1])
 
     def __getitem__(self, windows: Tensor) -> dict[str, Tensor]:
+        windows = windows.to(self.offsets.device)
         episode = torch.searchsorted(self.offsets, windows, right=True)
         begin = self.ends[episode] - (self.offsets[episode] - windows)  # may lie before the episode
         start = torch.maximum(begin, self.starts[episode])
         end = torch.minimum(begin + self.length, self.ends[episode])
-        index = start[:, None] + torch.arange(self.length)  # (B, T)
+        index = start[:, None] + torch.arange(self.length, device=start.device)  # (B, T)
         mask = index < end[:, None]
         index = torch.minimum(index, end[:, None] - 1)
-        return {name: column[index] for name, column in self.columns.items()} | {"mask": mask.float()}
+        return self.store[index] | {"mask": mask.float()}
 
     def tiles(self) -> Tensor:
         """Window numbers that cover each row exactly once: consecutive windows of every episode."""
-        lengths = self.ends - self.starts
+        lengths, offsets = (self.ends - self.starts).cpu(), self.offsets.cpu()
         count = (lengths + self.length - 1) // self.length  # (E,)
         episode = torch.repeat_interleave(torch.arange(len(lengths)), count)
         position = torch.arange(len(episode)) - torch.repeat_interleave(count.cumsum(0) - count, count)
-        return (self.offsets - lengths)[episode] + position * self.length
+        return (offsets - lengths)[episode] + position * self.length
 
 
 class Transitions(Dataset[dict[str, Tensor]]):
@@ -115,7 +173,9 @@ class Transitions(Dataset[dict[str, Tensor]]):
     there: what the value of `next_observations` counts for), `returns`.
     """
 
-    def __init__(self, dataset: OfflineDataset, *, discount: float, n_step: int = 1) -> None:
+    def __init__(
+        self, dataset: OfflineDataset, *, discount: float, n_step: int = 1, device: torch.device | str = "cpu"
+    ) -> None:
         last = np.repeat(dataset.episode_ends, dataset.episode_lengths) - 1  # (N,) last row of each row's episode
         rows = np.arange(len(dataset))
         end = np.minimum(rows + n_step - 1, last)
@@ -123,25 +183,31 @@ class Transitions(Dataset[dict[str, Tensor]]):
         for k in range(n_step):
             rewards += np.where(rows + k <= end, discount**k * dataset.rewards[np.minimum(rows + k, last)], 0.0)
         discounts = discount ** (end - rows + 1.0) * ~dataset.terminated[end]
+        self.states = Store(dataset, ("observations", "actions"), device)
+        self.following = Store(dataset, ("next_observations",), device)
         self.columns = dict(
-            observations=torch.as_tensor(dataset.observations),
-            actions=torch.as_tensor(dataset.actions),
-            rewards=torch.as_tensor(rewards).float(),
-            next_observations=torch.as_tensor(dataset.next_observations[end]),
-            discounts=torch.as_tensor(discounts).float(),
-            returns=torch.as_tensor(dataset.returns_to_go(discount)),
+            rewards=torch.as_tensor(rewards).float().to(device),
+            discounts=torch.as_tensor(discounts).float().to(device),
+            returns=torch.as_tensor(dataset.returns_to_go(discount)).to(device),
         )
+        self.end = torch.as_tensor(end, device=device)  # (N,) the row in which the n steps of each row end
 
     def __len__(self) -> int:
-        return len(self.columns["rewards"])
+        return len(self.end)
 
     def __getitem__(self, rows: Tensor) -> dict[str, Tensor]:
-        return {name: column[rows] for name, column in self.columns.items()}
+        rows = rows.to(self.end.device)
+        return self.states[rows] | self.following[self.end[rows]] | {name: c[rows] for name, c in self.columns.items()}
 
 
 def _loader(dataset: Dataset[dict[str, Tensor]], draws: Iterable[Tensor]) -> DataLoader[dict[str, Tensor]]:
     """Batches of whole draws; its own generator, since a DataLoader takes a number from the global one per epoch."""
     return DataLoader(dataset, sampler=draws, batch_size=None, generator=torch.Generator())
+
+
+def _device(data: L.LightningDataModule) -> torch.device:
+    """Where the trainer works, if there is one."""
+    return torch.device("cpu") if data.trainer is None else data.trainer.strategy.root_device
 
 
 class WindowData(L.LightningDataModule):
@@ -180,13 +246,13 @@ class WindowData(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
         """Batches (B, T, …) of `Windows`."""
-        windows = Windows(self.train, self.context)
+        windows = Windows(self.train, self.context, _device(self))
         sampler = DrawSampler(len(windows), (self.batch_size,), self.updates_per_epoch, seed=self.seed)
         return _loader(windows, sampler)
 
     def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:
         """Each held-out row once."""
-        windows = Windows(self.held_out, self.context)
+        windows = Windows(self.held_out, self.context, _device(self))
         return _loader(windows, windows.tiles().split(256))
 
     def test_dataloader(self) -> DataLoader[dict[str, Tensor]]:
@@ -241,7 +307,7 @@ class TransitionData(L.LightningDataModule):
     @cached_property
     def transitions(self) -> Transitions:
         """All rows of the dataset, with their n-step targets and returns to go."""
-        return Transitions(self.dataset, discount=self.discount, n_step=self.n_step)
+        return Transitions(self.dataset, discount=self.discount, n_step=self.n_step, device=_device(self))
 
     def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
         """Batches (updates_per_step, batch_size, …) of `Transitions`."""

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from envtf_lit.data.columns import Column, FileRows, column_blocks, take
 from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
 from envtf_lit.errors import UserError
 from envtf_lit.tasks import Task, find_task, get_task
@@ -24,7 +25,6 @@ NUMBERS = ("observations", "actions", "rewards", "next_observations")
 FLAGS = {"terminated": "terminals", "truncated": "timeouts"}  # and what D4RL calls them
 NEEDED = ("observations", "actions", "rewards")
 ACTION_TOLERANCE = 1e-5
-BLOCK_BYTES = 16 << 20  # columns are looked at in blocks of about this size
 
 Kind = Literal["error", "warning", "note"]
 
@@ -95,7 +95,7 @@ def examine(
         UserError: `task` is none of ours.
     """
     findings = [*broken.values(), *_missing({*columns, *broken}), *_misshapen(columns)]
-    data: dict[str, np.ndarray] = {}
+    data: dict[str, Any] = {}
     for name, values in columns.items():
         if len(values.shape) == RANKS[name] and 0 not in values.shape:
             data[name] = _read(name, values, findings)
@@ -126,12 +126,6 @@ def _failed(findings: list[Finding]) -> bool:
     return any(finding.kind == "error" for finding in findings)
 
 
-def blocks(rows: int, row_bytes: int = 4) -> Iterator[slice]:
-    """Slices that cover [0, rows), each of about `BLOCK_BYTES`."""
-    size = max(1, BLOCK_BYTES // max(1, row_bytes))
-    return (slice(begin, min(begin + size, rows)) for begin in range(0, rows, size))
-
-
 def _missing(columns: Set[str]) -> Iterator[Finding]:
     for name in NEEDED:
         if name not in columns:
@@ -160,7 +154,7 @@ def _misshapen(columns: Mapping[str, Any]) -> Iterator[Finding]:
         yield Finding("error", f"'next_observations' has shape {there} and 'observations' {here}", "make them equal")
 
 
-def _read(name: str, values: Any, findings: list[Finding]) -> np.ndarray:
+def _read(name: str, values: Any, findings: list[Finding]) -> Column:
     """As float32, bool or int64, block by block; what is wrong with the values goes to the findings."""
     dtype = np.float32 if name in NUMBERS else bool if name in FLAGS else np.int64
     if values.dtype.kind not in "biuf":
@@ -168,10 +162,11 @@ def _read(name: str, values: Any, findings: list[Finding]) -> np.ndarray:
         return np.zeros(values.shape, dtype)
     if dtype is np.float32 and values.dtype.itemsize > 4:
         findings.append(Finding("note", f"{name!r} is {values.dtype} and becomes float32"))
-    keep = isinstance(values, np.ndarray) and values.dtype == dtype and values.flags.c_contiguous
-    column = values if keep else np.empty(values.shape, dtype)
+    plain = isinstance(values, np.ndarray) and values.dtype == dtype and values.flags.c_contiguous
+    keep = plain or isinstance(values, FileRows)
+    column: Any = values if keep else np.empty(values.shape, dtype)
     bad, first = 0, -1
-    for block in blocks(len(column), column[:1].nbytes):
+    for block in column_blocks(column):
         try:
             part = np.asarray(values[block])
         except Exception as error:  # whatever a decoder of damaged bytes raises
@@ -226,7 +221,7 @@ def _find_task(asked: str | None, stored: Any, findings: list[Finding]) -> Task 
     return task
 
 
-def _check_robot(data: Mapping[str, np.ndarray], task: Task | None, findings: list[Finding]) -> bool:
+def _check_robot(data: Mapping[str, Column], task: Task | None, findings: list[Finding]) -> bool:
     """Whether the dimensions are the robot's."""
     if task is None or "observations" not in data or "actions" not in data:
         return True
@@ -240,7 +235,7 @@ def _check_robot(data: Mapping[str, np.ndarray], task: Task | None, findings: li
 
 
 def _action_limits(
-    attributes: Mapping[str, Any], task: Task | None, data: Mapping[str, np.ndarray], findings: list[Finding]
+    attributes: Mapping[str, Any], task: Task | None, data: Mapping[str, Column], findings: list[Finding]
 ) -> tuple[np.ndarray, np.ndarray]:
     if "actions" not in data:
         return np.zeros(0, np.float32), np.zeros(0, np.float32)
@@ -260,10 +255,10 @@ def _action_limits(
     return low, high
 
 
-def _inside(actions: np.ndarray, low: np.ndarray, high: np.ndarray, findings: list[Finding]) -> np.ndarray:
+def _inside(actions: Column, low: np.ndarray, high: np.ndarray, findings: list[Finding]) -> Column:
     """Actions in their space: what lies a rounding error outside is moved to its edge."""
     first, least, most, over = -1, np.inf, -np.inf, False
-    for block in blocks(len(actions), actions[:1].nbytes):
+    for block in column_blocks(actions):
         part = actions[block]
         outside = ((part < low - ACTION_TOLERANCE) | (part > high + ACTION_TOLERANCE)).any(axis=1)
         if outside.any() and first < 0:
@@ -274,10 +269,10 @@ def _inside(actions: np.ndarray, low: np.ndarray, high: np.ndarray, findings: li
         space = f"outside the action space [{low.min():g}, {high.max():g}], first at row {first}"
         fix = "rescale them, or store 'action_low' and 'action_high'"
         findings.append(Finding("error", f"actions reach from {least:g} to {most:g}, {space}", fix))
-    return np.clip(actions, low, high) if over else actions
+    return np.clip(np.asarray(actions), low, high) if over else actions
 
 
-def _find_episodes(data: dict[str, np.ndarray], findings: list[Finding]) -> np.ndarray:
+def _find_episodes(data: dict[str, Any], findings: list[Finding]) -> np.ndarray:
     """(E,) starts, and the flags made to mark the last row of every episode.
 
     An episode ends where a flag is set or the index changes. An end without a flag is a truncation.
@@ -315,9 +310,7 @@ def _indexed_ends(index: np.ndarray, flagged: np.ndarray, findings: list[Finding
     return ends
 
 
-def _shift(
-    data: dict[str, np.ndarray], starts: np.ndarray, findings: list[Finding]
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _shift(data: dict[str, Any], starts: np.ndarray, findings: list[Finding]) -> tuple[dict[str, Any], np.ndarray]:
     """Successors from the following row; each episode loses its last row, which has none, and so ends truncated."""
     rows = len(data["rewards"])
     last = np.zeros(rows, bool)
@@ -334,7 +327,7 @@ def _shift(
     )
     episode = np.repeat(np.arange(len(starts)), np.diff(starts, append=rows))[kept]
     ends = np.append(episode[1:] != episode[:-1], True)
-    shifted = {name: data[name][kept] for name in ("observations", "actions", "rewards")}
-    shifted["next_observations"] = data["observations"][kept + 1]
+    shifted: dict[str, Any] = {name: take(data[name], kept) for name in ("observations", "actions", "rewards")}
+    shifted["next_observations"] = take(data["observations"], kept + 1)
     shifted["terminated"], shifted["truncated"] = np.zeros(len(kept), bool), ends
     return shifted, starts_from_ends(ends)

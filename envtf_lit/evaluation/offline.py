@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.imagination import imagine
 from envtf_lit.policy import Policy
-from envtf_lit.tasks import never_terminated
 from envtf_lit.world_models.horizon import HorizonReport, Trajectories
 from envtf_lit.world_models.interface import WorldModel
 
@@ -81,13 +80,14 @@ def imagined_returns(model: WorldModel, policy: Policy, held_out: Trajectories, 
     Rewards are cut to the range of the training data's, so that a model that runs away promises no more than was ever
     paid.
     """
-    B, steps = held_out.actions.shape[:2]
-    no_actions = held_out.actions[:, :0]
-    starts = held_out.observations[:, :1], no_actions, torch.ones_like(held_out.lengths)
-    imagined = imagine(model, policy, starts, horizon=0, tail=steps, terminated=never_terminated, mode="mean")
-    counts = imagined.step < held_out.lengths[imagined.branch]
-    rewards = torch.where(counts, _bounded(imagined.rewards, training), 0.0)
-    return torch.zeros(B, dtype=torch.float64).index_add_(0, imagined.branch.cpu(), rewards.cpu()).numpy()
+    first, no_actions = held_out.observations[:, :1], held_out.actions[:, :0]
+    state = model.init(first, no_actions, torch.ones_like(held_out.lengths))
+    total = torch.zeros(len(first), dtype=torch.float64, device=first.device)
+    for running in held_out.valid.T:  # (B,) who is still recorded at this step
+        action = policy.act(model.current(state), True)
+        state, prediction = model.step(state, action, mode="mean")
+        total += torch.where(running, _bounded(prediction.reward, training), 0.0)
+    return total.cpu().numpy()
 
 
 def _bounded(rewards: Tensor, training: OfflineDataset) -> Tensor:
@@ -97,7 +97,7 @@ def _bounded(rewards: Tensor, training: OfflineDataset) -> Tensor:
 
 def action_error(policy: Policy, held_out: Trajectories, training: OfflineDataset) -> float:
     """See `Promise.action_error`; zero where no action dimension varies."""
-    spread = torch.as_tensor(np.asarray(training.actions).std(axis=0, dtype=np.float64))
+    _, spread = moments(torch.as_tensor(training.actions[rows]) for rows in column_blocks(training.actions))
     live = spread > LIVE
     chosen = policy.act(held_out.observations[held_out.valid], True).cpu().double()
     error = (chosen - held_out.actions[held_out.valid].cpu().double())[:, live] / spread[live]

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.world_models.interface import Prediction, WorldModel
 
@@ -37,9 +38,12 @@ class Scale:
     @classmethod
     def of(cls, training: OfflineDataset, device: torch.device | str = "cpu") -> "Scale":
         """Statistics of the training data, accumulated in float64."""
-        columns = np.column_stack([training.observations, training.rewards]).astype(np.float64)
-        std = torch.from_numpy(columns.std(0)).float().to(device)
-        return cls(torch.from_numpy(columns.mean(0)).float().to(device), std, std >= CONSTANT_STD)
+        mean, std = moments(
+            torch.as_tensor(np.column_stack([training.observations[rows], training.rewards[rows]]))
+            for rows in column_blocks(training.observations)
+        )
+        std = std.float().to(device)
+        return cls(mean.float().to(device), std, std >= CONSTANT_STD)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
 
 CONSTANT = 1e-6  # a dimension whose standard deviation is below this is constant: not live
@@ -33,15 +34,21 @@ class Normaliser(nn.Module):
 
     def fit(self, dataset: OfflineDataset) -> None:
         """Takes means and standard deviations from the training rows."""
-        observations = torch.as_tensor(dataset.observations)
-        following = torch.as_tensor(dataset.next_observations)
-        target = torch.cat(
-            [following - observations if self.delta else following, torch.as_tensor(dataset.rewards)[:, None]], dim=-1
-        )
-        for name, rows in (
-            ("observation", observations), ("action", torch.as_tensor(dataset.actions)), ("target", target)
-        ):  # fmt: skip
-            std, mean = torch.std_mean(rows.double(), dim=0, correction=0)
+
+        def targets(rows: slice) -> Tensor:
+            following, rewards = (
+                torch.as_tensor(dataset.next_observations[rows]),
+                torch.as_tensor(dataset.rewards[rows]),
+            )
+            change = following - torch.as_tensor(dataset.observations[rows]) if self.delta else following
+            return torch.cat([change, rewards[:, None]], dim=-1)
+
+        for name, values in (
+            ("observation", lambda rows: torch.as_tensor(dataset.observations[rows])),
+            ("action", lambda rows: torch.as_tensor(dataset.actions[rows])),
+            ("target", targets),
+        ):
+            mean, std = moments(map(values, column_blocks(dataset.observations)))
             getattr(self, f"{name}_mean").copy_(mean)
             getattr(self, f"{name}_std").copy_(torch.where(std < CONSTANT, 1.0, std))
             if name == "observation":

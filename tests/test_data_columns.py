@@ -1,0 +1,199 @@
+"""Large files stay where they are: the same rows, the same batches and the same weights, to the bit."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from walker import walker_dataset
+
+from envtf_lit import pipeline
+from envtf_lit.config import preset_params
+from envtf_lit.data.columns import FileRows, column_blocks, moments
+from envtf_lit.data.dataset import COLUMNS
+from envtf_lit.data.formats import load_dataset, save_dataset
+from envtf_lit.data.inspection import inspect_file
+from envtf_lit.data.loaders import Store, Transitions, Windows
+from envtf_lit.errors import UserError
+from envtf_lit.imagination import BranchPoints
+from envtf_lit.storage import pick_device
+
+WIDE = ("observations", "actions", "next_observations")
+
+
+@pytest.fixture
+def matrix(tmp_path: Path) -> tuple[np.ndarray, FileRows]:
+    """Seventeen rows of three, and the same in a file, after five bytes of something else."""
+    rows = np.random.default_rng(0).normal(size=(17, 3)).astype(np.float32)
+    (tmp_path / "rows").write_bytes(b"12345" + rows.tobytes())
+    return rows, FileRows(tmp_path / "rows", 5, (17, 3))
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(data=st.data())
+def test_rows_of_a_file_are_those_of_the_array(matrix: tuple[np.ndarray, FileRows], data: st.DataObject):
+    array, rows = matrix
+    if data.draw(st.booleans()):
+        chosen = np.array(data.draw(st.lists(st.integers(0, 16), min_size=1, max_size=20)))
+        array, rows = array[chosen], rows.select(chosen)
+    assert (rows.shape, len(rows), rows.nbytes, rows.dtype) == (array.shape, len(array), array.nbytes, array.dtype)
+    if data.draw(st.booleans()):
+        index = slice(*data.draw(st.tuples(*[st.one_of(st.none(), st.integers(0, 20))] * 2)))
+    else:
+        shape = tuple(data.draw(st.lists(st.integers(0, 4), max_size=3)))
+        index = np.random.default_rng(data.draw(st.integers(0, 9))).integers(0, len(array), shape)
+    found = rows[index]
+    assert np.array_equal(found, array[index]) and found.dtype == array.dtype and found.shape == array[index].shape
+    assert np.array_equal(np.asarray(rows), array)
+
+
+def test_rows_that_are_not_there(matrix: tuple[np.ndarray, FileRows], tmp_path: Path):
+    _, rows = matrix
+    for index in ([17], [-1], [0, 99]):
+        with pytest.raises(IndexError, match="of a column of 17"):
+            rows[np.array(index)]
+    with (tmp_path / "rows").open("r+b") as file:
+        file.truncate(100)
+    with pytest.raises(UserError, match="has become shorter"):
+        rows[np.array([16])]
+
+
+def test_a_file_that_is_replaced_does_no_harm(matrix: tuple[np.ndarray, FileRows], tmp_path: Path):
+    array, rows = matrix
+    (tmp_path / "new").write_bytes(b"other")
+    (tmp_path / "new").replace(tmp_path / "rows")
+    assert np.array_equal(np.asarray(rows), array)
+
+
+def test_moments_of_blocks_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch):
+    rows = np.random.default_rng(0).normal(3.0, 2.0, (1000, 4)).astype(np.float32)
+    whole = torch.std_mean(torch.as_tensor(rows).double(), dim=0, correction=0)
+    assert torch.equal(moments([torch.as_tensor(rows)])[1], whole[0])
+    monkeypatch.setattr("envtf_lit.data.columns.BLOCK_BYTES", 16 * 37)
+    mean, std = moments(torch.as_tensor(rows[block]) for block in column_blocks(rows))
+    torch.testing.assert_close((std, mean), whole, rtol=1e-12, atol=0)
+
+
+# datasets
+
+
+@pytest.fixture
+def in_file(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """Every file counts as a large one."""
+    monkeypatch.setattr("envtf_lit.data.formats.RESIDENT_BYTES", 0)
+    return monkeypatch
+
+
+@pytest.mark.parametrize("ending", [".h5", ".npz"])
+def test_wide_columns_of_large_files_stay_there(tmp_path: Path, ending: str, in_file: pytest.MonkeyPatch):
+    dataset = walker_dataset()
+    save_dataset(dataset, tmp_path / f"log{ending}")
+    read = load_dataset(tmp_path / f"log{ending}")
+    assert all(isinstance(getattr(read, name), FileRows) for name in WIDE)
+    assert isinstance(read.rewards, np.ndarray)
+    for name in COLUMNS:
+        assert np.array_equal(getattr(read, name), getattr(dataset, name)), name
+    for one, two in zip(read.split(0.3, seed=0), dataset.split(0.3, seed=0), strict=True):
+        assert isinstance(one.observations, FileRows)
+        for name in (*COLUMNS, "episode_starts"):
+            assert np.array_equal(getattr(one, name), getattr(two, name)), name
+    save_dataset(read, tmp_path / f"again{ending}")
+    assert (tmp_path / f"again{ending}").read_bytes() == (tmp_path / f"log{ending}").read_bytes()
+
+
+def test_what_cannot_be_read_in_place_is_read_whole(tmp_path: Path, in_file: pytest.MonkeyPatch):
+    dataset = walker_dataset()
+    arrays = {name: np.asarray(getattr(dataset, name)) for name in COLUMNS}
+    np.savez_compressed(tmp_path / "small.npz", allow_pickle=False, **arrays)
+    np.savez(tmp_path / "double.npz", allow_pickle=False, **arrays | {"actions": arrays["actions"].astype(np.float64)})
+    columns_first = {name: np.asfortranarray(values) for name, values in arrays.items()}
+    np.savez(tmp_path / "turned.npz", allow_pickle=False, **columns_first)
+    for name, kept in (("small", ()), ("double", ("observations", "next_observations")), ("turned", ())):
+        read = load_dataset(tmp_path / f"{name}.npz")
+        assert [column for column in COLUMNS if isinstance(getattr(read, column), FileRows)] == sorted(
+            kept, key=COLUMNS.index
+        )
+        assert all(np.array_equal(getattr(read, column), arrays[column]) for column in COLUMNS)
+
+
+def test_shifted_successors_are_read_in_place(tmp_path: Path, in_file: pytest.MonkeyPatch):
+    arrays = {name: getattr(walker_dataset(), name) for name in COLUMNS if name != "next_observations"}
+    np.savez(tmp_path / "log.npz", allow_pickle=False, **arrays)
+    read = load_dataset(tmp_path / "log.npz")
+    in_file.undo()
+    resident = load_dataset(tmp_path / "log.npz")
+    assert isinstance(read.next_observations, FileRows)
+    assert all(np.array_equal(getattr(read, name), getattr(resident, name)) for name in COLUMNS)
+
+
+def test_the_check_of_a_large_file_says_the_same(tmp_path: Path, in_file: pytest.MonkeyPatch):
+    save_dataset(walker_dataset(), tmp_path / "log.h5")
+    large = inspect_file(tmp_path / "log.h5")
+    in_file.undo()
+    assert inspect_file(tmp_path / "log.h5").findings == large.findings
+
+
+def test_branch_points_are_the_same(tmp_path: Path, in_file: pytest.MonkeyPatch):
+    save_dataset(walker_dataset(), tmp_path / "log.h5")
+    drawn = []
+    for dataset in (walker_dataset(), load_dataset(tmp_path / "log.h5")):
+        drawn.append(BranchPoints(dataset).draw(20, 3, torch.Generator().manual_seed(0)))
+    assert all(torch.equal(one, two) for one, two in zip(*drawn, strict=True))
+
+
+@pytest.mark.skipif(not torch.accelerator.is_available(), reason="no accelerator")
+@pytest.mark.parametrize("fits", [True, False])
+def test_a_device_gathers_the_same_rows(tmp_path: Path, in_file: pytest.MonkeyPatch, fits: bool):
+    save_dataset(walker_dataset(), tmp_path / "log.h5")
+    in_file.setattr("envtf_lit.data.loaders._fits", lambda size, device: fits)
+    dataset, device, rows = load_dataset(tmp_path / "log.h5"), pick_device(), torch.tensor([[0, 3], [9, 9]])
+    there, here = Store(dataset, WIDE, device), Store(dataset, WIDE)
+    assert all(isinstance(column, torch.Tensor) == fits for column in there.columns.values())
+    for name, column in there[rows].items():
+        assert column.device.type == device.type
+        assert torch.equal(column.cpu(), here[rows][name])
+    for kind in (
+        lambda where: Windows(dataset, 4, where),
+        lambda where: Transitions(dataset, discount=0.9, device=where),
+    ):
+        for name, column in kind(device)[rows[0]].items():
+            assert torch.equal(column.cpu(), kind("cpu")[rows[0]][name]), name
+
+
+# training
+
+
+def train(root: Path) -> dict[str, bytes]:
+    """The weights of a world model, a clone and a policy, and the imagined rollouts."""
+    tiny = preset_params("tiny")
+    imagination = replace(tiny.train_policy.et_cql.imagination, selection_episodes=0)  # pyright: ignore[reportArgumentType,reportCallIssue]
+    params = replace(
+        tiny,
+        threads=1,
+        train_model=replace(tiny.train_model, updates=10, updates_per_epoch=5),
+        train_policy=replace(
+            tiny.train_policy,
+            et_cql=replace(
+                tiny.train_policy.et_cql, updates=30, updates_per_epoch=10, warm_start=10, imagination=imagination
+            ),
+        ),
+    )
+    pipeline.train_model(params, root, progress=False)
+    pipeline.generate_rollouts(params, root, progress=False)
+    pipeline.train_policy(params, root, algorithm="et_cql", progress=False)
+    folders = ("world_model", "behaviour", "policy/et_cql")
+    weights = {name: (root / "models" / name / "weights.safetensors").read_bytes() for name in folders}
+    return weights | {"rollouts": (root / "data/rollouts.h5").read_bytes()}
+
+
+def test_every_stage_learns_the_same_bits_from_memory_and_from_the_file(tmp_path: Path, in_file: pytest.MonkeyPatch):
+    in_file.setattr("envtf_lit.data.columns.BLOCK_BYTES", 2000)  # statistics are merged from several blocks
+    save_dataset(walker_dataset(), tmp_path / "data/dataset.h5")
+    assert isinstance(load_dataset(tmp_path / "data/dataset.h5").observations, FileRows)
+    from_file = train(tmp_path)
+    in_file.setattr("envtf_lit.data.formats.RESIDENT_BYTES", 1 << 30)
+    assert isinstance(load_dataset(tmp_path / "data/dataset.h5").observations, np.ndarray)
+    assert train(tmp_path) == from_file
