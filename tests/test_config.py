@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
@@ -104,6 +104,7 @@ def test_a_whole_float_is_a_fine_count(tmp_path: Path) -> None:
     assert isinstance(updates, int)
 
 
+@settings(deadline=None)  # the first example pays for imports
 @given(st.integers(1, 10**9), st.floats(1e-12, 1e3), st.lists(st.integers(1, 4096), min_size=1, max_size=5))
 def test_what_is_written_is_what_was_meant(seed: int, rate: float, hidden: list[int]) -> None:
     tree = {"seed": seed, "train_model": {"learning_rate": rate}, "train_policy": {"cql": {"hidden": hidden}}}
