@@ -15,10 +15,10 @@ from torch import Tensor
 from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.world_models.interface import Prediction, WorldModel
+from envtf_lit.world_models.normaliser import CONSTANT
 
 THRESHOLDS = (0.01, 0.1)
 HORIZONS = (1, 5, 10, 50, 100, 500, 1000)
-CONSTANT_STD = 1e-6  # a dimension that varies less carries no information and is left out
 EXPLODED = 10.0  # nmse beyond which a rollout has left anything that the data holds
 
 
@@ -43,7 +43,7 @@ class Scale:
             for rows in column_blocks(training.observations)
         )
         std = std.float().to(device)
-        return cls(mean.float().to(device), std, std >= CONSTANT_STD)
+        return cls(mean.float().to(device), std, std >= CONSTANT)
 
 
 @dataclass(frozen=True, eq=False)
