@@ -219,12 +219,12 @@ class Imagination:
         starts = self.first[:, None], no_actions, torch.ones(B, dtype=torch.long, device=self.first.device)
         episodes = imagine(
             self.model,
-            _Deterministic(policy),
+            policy,
             starts,
-            horizon=self.options.selection_steps,
+            horizon=0,
+            tail=self.options.selection_steps,
             terminated=self.terminated,
             novelty_limit=self.options.novelty_limit,
-            mode="mean",
         )
         return float(episodes.rewards.double().sum() / B)
 
