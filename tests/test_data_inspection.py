@@ -60,6 +60,13 @@ def test_an_episode_end_without_a_flag_is_seen_as_a_gap():
     )
 
 
+def test_successors_taken_from_the_next_episode_are_seen():
+    dataset = walker_dataset()
+    shifted = np.roll(dataset.observations, -1, axis=0)
+    expected = f"warning: {len(dataset.episode_starts) - 1} of {len(dataset.episode_starts) - 1} ends of episodes have"
+    assert expected in said(dataset, next_observations=shifted)
+
+
 def test_constant_dimensions_and_rewards():
     dataset = walker_dataset()
     observations, actions = np.array(dataset.observations), np.array(dataset.actions)

@@ -145,21 +145,26 @@ def _endings(dataset: OfflineDataset) -> Iterator[Finding]:
 
 
 def _seams(dataset: OfflineDataset) -> Iterator[Finding]:
-    """Rows whose successor is not the next row's state: an episode end that no flag marks."""
+    """Successors that do not fit the row after: within episodes an end that no flag marks, at ends a shifted column."""
     scale = SEAM * np.maximum(dataset.observations[: 1 << 16].std(axis=0, dtype=np.float64), CONSTANT)
     last = np.zeros(len(dataset), bool)
     last[dataset.episode_ends - 1] = True
-    gaps, first = 0, -1
+    gaps, first, borrowed = 0, -1, 0
     for block in blocks(len(dataset) - 1, 4 * dataset.observation_dim):
         after = slice(block.start + 1, block.stop + 1)
         with np.errstate(over="ignore"):  # infinitely far is far
             jump = (np.abs(dataset.next_observations[block] - dataset.observations[after]) > scale).any(axis=1)
+        borrowed += int((~jump & last[block]).sum())
         jump &= ~last[block]
         first = block.start + int(jump.argmax()) if first < 0 and jump.any() else first
         gaps += int(jump.sum())
     if gaps:
         what = f"{gaps} rows inside episodes have a successor that is not the next row's state, first at row {first}"
         yield Finding("warning", what, "mark the ends of episodes there (truncated), or mend 'next_observations'")
+    if borrowed:
+        what = f"{borrowed} of {last.sum() - 1} ends of episodes have the next episode's first state as their successor"
+        fix = "unless a recording was merely cut there, 'next_observations' is 'observations' shifted: store what came"
+        yield Finding("warning", what, fix)
 
 
 def _ranges(dataset: OfflineDataset) -> Iterator[Finding]:
