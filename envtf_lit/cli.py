@@ -117,19 +117,24 @@ def _add_zoo(commands: Any) -> None:
     build.add_argument(
         "tasks", nargs="*", metavar="TASK", help="such as hopper-medium, hopper-medium-v4, ant-medium-105d"
     )
-    build.add_argument("--all", action="store_true", help="the twenty")
+    build.add_argument("--all", action="store_true", help="the twenty, beside those named")
     build.add_argument("--out", type=Path, default=Path("data/zoo"), metavar="DIR", help="default: data/zoo")
     size = build.add_mutually_exclusive_group()
     size.add_argument("--transitions", type=int, metavar="N", help="rows of each; default: 200,000")
     size.add_argument("--full", action="store_true", help="1,000,000 rows of each")
-    build.add_argument("--workers", type=int, default=2, help="processes; they do not change the data; default: 2")
+    build.add_argument(
+        "--workers",
+        type=_natural,
+        default=os.cpu_count() or 1,
+        help="processes; they do not change the data; default: one per core",
+    )
     train = _add(verbs, "train", "Train behaviour policies (needs the extra `behaviour`)", _zoo_train)
     train.add_argument("--robot", required=True, choices=["ant", "halfcheetah", "hopper", "walker2d"])
     train.add_argument("--out", type=Path, required=True, metavar="DIR", help="for build's and list's --zoo")
     train.add_argument("--algorithm", choices=["crossq", "sac"], default="crossq", help="default: crossq")
     train.add_argument("--steps", type=int, default=600_000, help="environment steps; default: 600,000")
     for command in (build, train):
-        command.add_argument("--seed", type=int, default=0, help="default: 0")
+        command.add_argument("--seed", type=_natural, default=0, help="default: 0")
         command.add_argument("--quiet", action="store_true", help="no progress bars")
     for command in (listing, build):
         command.add_argument("--zoo", type=Path, metavar="DIR", help="policies of your own, from `envtf zoo train`")
@@ -274,6 +279,13 @@ def _zoo_list(namespace: argparse.Namespace, rest: list[str]) -> None:
     Console().print(table)
 
 
+def _natural(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{value} is below zero: choose 0 or more")
+    return value
+
+
 def _zoo_build(namespace: argparse.Namespace, rest: list[str]) -> None:
     from rich.console import Console
 
@@ -282,7 +294,7 @@ def _zoo_build(namespace: argparse.Namespace, rest: list[str]) -> None:
 
     console = Console(highlight=False, markup=False, soft_wrap=True)
     build(
-        [*TASKS] if namespace.all else namespace.tasks,
+        [*(TASKS if namespace.all else ()), *namespace.tasks],
         namespace.out,
         transitions=FULL if namespace.full else TRANSITIONS if namespace.transitions is None else namespace.transitions,
         seed=namespace.seed,

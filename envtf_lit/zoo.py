@@ -64,13 +64,17 @@ def build(
         The table of all datasets in the folder.
 
     Raises:
-        UserError: no task is given, one is unknown, or `transitions` is too small for one.
+        UserError: no task is given, one is unknown, `transitions` is too small for one, or `out` cannot be made.
     """
     wanted = [get_task(name) for name in dict.fromkeys(tasks)]
     if not wanted:
         raise UserError("No task is named: give some, such as hopper-medium, or --all.")
     for task in wanted:
         plan(task, transitions, read_series(task.robot, zoo))  # complains before the first is begun
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out} cannot hold datasets ({error.strerror}): choose another folder.") from None
     for task in wanted:
         if _is_made(task, out, describe_origin(task, transitions, seed, zoo)):
             report(f"{task.name}: is there")
@@ -110,9 +114,12 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def _cards(out: Path) -> Iterator[dict[str, Any]]:
-    """The cards of the folder's datasets, in the order of the twenty tasks, variants after them."""
-    order = [*TASKS]
-    cards = [read_json(path) for path in sorted(out.glob("*.json")) if path.with_suffix(".h5").exists()]
+    """The cards of the folder's datasets, in the order of the twenty tasks, variants after them; no others' cards."""
+    order, cards = [*TASKS], list[dict[str, Any]]()
+    for path in sorted(out.glob("*.json")):
+        card = read_json(path) if path.with_suffix(".h5").exists() else None
+        if isinstance(card, dict) and card.get("source") == "zoo" and card.get("task") == path.stem and "bytes" in card:
+            cards.append(card)
     yield from sorted(cards, key=lambda card: order.index(card["task"]) if card["task"] in order else len(order))
 
 

@@ -94,8 +94,29 @@ def test_all_means_the_twenty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     main(["zoo", "build", "--all", "--full", "--out", str(tmp_path)])
     assert asked["tasks"] == [*TASKS]
     assert (asked["transitions"], asked["seed"], asked["out"]) == (1_000_000, 0, tmp_path)
+    main(["zoo", "build", "ant-medium-105d", "--all"])
+    assert asked["tasks"] == [*TASKS, "ant-medium-105d"]
     main(["zoo", "build", "ant-medium"])
     assert (asked["tasks"], asked["transitions"], asked["out"]) == (["ant-medium"], 200_000, Path("data/zoo"))
+
+
+def test_cards_of_other_datasets_in_the_folder_are_left_alone(tmp_path: Path) -> None:
+    build_again(tmp_path, ["hopper-random"])
+    for name, card in (("dataset", {"source": "file"}), ("copy", {"source": "zoo", "task": "hopper-random"})):
+        (tmp_path / f"{name}.h5").write_bytes((tmp_path / "hopper-random.h5").read_bytes())
+        (tmp_path / f"{name}.json").write_text(json.dumps(card))
+    assert [entry.task for entry in build_again(tmp_path, ["hopper-random"])] == ["hopper-random"]
+
+
+def test_a_folder_that_cannot_be_made_and_a_negative_seed_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot hold datasets"):
+        build_again(tmp_path / "file" / "zoo", ["hopper-random"])
+    with pytest.raises(SystemExit):
+        main(["zoo", "build", "hopper-random", "--seed", "-1"])
+    assert "-1 is below zero" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
