@@ -129,8 +129,8 @@ def _entry(card: dict[str, Any]) -> Entry:
         card["env_id"],
         card["transitions"],
         card["episodes"],
-        mean_score=round(card["scores"]["mean"], 2),
-        max_score=round(card["scores"]["max"], 2),
+        mean_score=round(card["scores"]["mean"], 1) + 0.0,  # no minus before a zero
+        max_score=round(card["scores"]["max"], 1) + 0.0,
         seconds=card["seconds"],
         megabytes=round(card["bytes"] / 1e6, 1),
     )

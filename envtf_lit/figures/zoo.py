@@ -32,9 +32,9 @@ def score_distributions(scores: Mapping[str, np.ndarray], path: str | Path) -> P
                 counts, _ = np.histogram(scores[name], edges)
                 colour = TIER_COLOURS[get_task(name).tier]
                 axis.stairs(place + 0.85 * counts / counts.max(), edges, baseline=place, fill=True, color=colour)
-                mean = scores[name].mean()
+                mean = float(scores[name].mean())
                 axis.plot([mean, mean], [place, place + 0.85], color="black", linewidth=1.2)
-                axis.annotate(f"{mean:.0f}", (mean, place + 0.86), ha="center", va="bottom", fontsize="x-small")
+                axis.annotate(str(round(mean)), (mean, place + 0.86), ha="center", va="bottom", fontsize="x-small")
             labels = [name.removeprefix(f"{robot}-") for name in reversed(names)]
             axis.set_yticks(np.arange(len(names)) + 0.3, labels)
             axis.set_ylim(0, len(names) + 0.15)
