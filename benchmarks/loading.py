@@ -33,7 +33,8 @@ from envtf_lit.world_models.lit import LitWorldModel
 
 LARGE, SMALL = 2_000_000, 20_000
 S, A, EPISODE = 105, 8, 1_000
-WINDOW_BATCHES, ROW_BATCHES = 100, 10  # of 32 windows, of 10 x 256 rows
+THREADS = int(os.environ.get("OMP_NUM_THREADS", Params().threads))
+WINDOW_BATCHES, ROW_BATCHES = 60, 6  # of 32 windows, of 10 x 256 rows
 
 
 class Walk:
@@ -102,7 +103,7 @@ def batches_per_second(loader: Any, count: int) -> float:
 def measure(path: Path, learner: str) -> dict[str, Any]:
     """Loads, gives batches to nobody, then to a learner; in a process of its own."""
     memory, params = Memory(), Params()
-    torch.set_num_threads(params.threads)
+    torch.set_num_threads(THREADS)
     model, policy = params.train_model, params.train_policy.cql
     if learner == "world model":
         data = WindowData(str(path), model.model.context, model.batch_size, WINDOW_BATCHES, seed=0)
@@ -130,7 +131,7 @@ def index_seconds(path: Path, context: int) -> float:
 
 
 def main(folder: Path) -> dict[str, Any]:
-    result: dict[str, Any] = {"threads": Params().threads, "torch": torch.__version__, "machine": platform.machine()}
+    result: dict[str, Any] = {"threads": THREADS, "torch": torch.__version__, "machine": platform.machine()}
     for rows in (SMALL, LARGE):
         path = folder / f"{rows}.h5"
         write_log(path, rows)
@@ -152,7 +153,6 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--measure"]:
         print(json.dumps(measure(Path(sys.argv[2]), sys.argv[3])))
     else:
-        os.environ.setdefault("OMP_NUM_THREADS", str(Params().threads))
         with tempfile.TemporaryDirectory() as temporary:
             text = json.dumps(main(Path(temporary)), indent=2)
         print(text)

@@ -144,7 +144,6 @@ def test_branch_points_are_the_same(tmp_path: Path, in_file: pytest.MonkeyPatch)
     assert all(torch.equal(one, two) for one, two in zip(*drawn, strict=True))
 
 
-@pytest.mark.skipif(not torch.accelerator.is_available(), reason="no accelerator")
 @pytest.mark.parametrize("fits", [True, False])
 def test_a_device_gathers_the_same_rows(tmp_path: Path, in_file: pytest.MonkeyPatch, fits: bool):
     save_dataset(walker_dataset(), tmp_path / "log.h5")
