@@ -39,7 +39,7 @@ HDF5_FILTERS = {1, 2, 3, 4, 5, 6, 32000}  # gzip, shuffle, fletcher32, szip, nbi
 # no log of numbers shrinks to a 200th: a file that declares more than this, and more than that, is damaged or a trap
 BOMB_RATIO, BOMB_BYTES = 200, 256 << 20
 LARGEST_ATTRIBUTE = 1 << 20  # bytes
-# of a file with more than this, wide columns stay there and are read as they are needed
+# of a file with more than this, columns of more than a quarter of it stay there and are read as they are needed
 RESIDENT_BYTES = 256 << 20
 
 
@@ -233,7 +233,8 @@ def _hdf5_rows(path: Path, item: h5py.Dataset) -> FileRows | None:
     """The same array outside of HDF5, if it lies in one piece in the form that we keep it in."""
     offset = item.id.get_offset()
     plain = item.chunks is None and item.dtype == np.dtype("<f4") and item.file.userblock_size == 0
-    if not plain or offset is None or item.ndim != 2 or offset + hdf5_bytes(item) > path.stat().st_size:
+    wide = item.ndim == 2 and hdf5_bytes(item) > RESIDENT_BYTES // 4
+    if not (plain and wide) or offset is None or offset + hdf5_bytes(item) > path.stat().st_size:
         return None
     return FileRows(path, offset, item.shape)
 
@@ -283,7 +284,8 @@ def _read_member(raw: Raw, path: Path, archive: zipfile.ZipFile, member: str, co
             if math.prod(shape) * dtype.itemsize > archive.getinfo(member).file_size - begin:
                 raise ValueError(f"it declares shape {shape} and holds less")
             plain = dtype == np.dtype("<f4") and len(shape) == 2 and not columns_first and 0 not in shape
-            if plain and path.stat().st_size > RESIDENT_BYTES and (start := _stored_at(path, archive, member)):
+            large = path.stat().st_size > RESIDENT_BYTES and archive.getinfo(member).file_size > RESIDENT_BYTES // 4
+            if plain and large and (start := _stored_at(path, archive, member)):
                 raw.columns[column] = FileRows(path, start + begin, (shape[0], shape[1]))
                 return
         with archive.open(member) as stream:
