@@ -113,8 +113,8 @@ def _root(gram: Tensor) -> Tensor:
 
 def _surprise(squared: Tensor, aleatoric: Tensor, spread: Tensor) -> Tensor:
     """(C,) negative log-likelihood, up to a constant, of squared residuals (n, K) at each candidate of c."""
-    total = [aleatoric + scale * spread for scale in SCALES.to(squared.device)]
-    return torch.stack([0.5 * (squared / variance + variance.log()).sum() for variance in total]).to(SCALES.device)
+    variances = (aleatoric + scale * spread for scale in SCALES.to(squared.device))  # one at a time: each is (n, K)
+    return torch.stack([0.5 * (squared / variance + variance.log()).sum() for variance in variances]).to(SCALES.device)
 
 
 def _quantile(values: Tensor, share: float) -> Tensor:
