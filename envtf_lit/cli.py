@@ -115,7 +115,10 @@ def _add_zoo(commands: Any) -> None:
     listing = _add(verbs, "list", "Print the twenty datasets and the policies behind each", _zoo_list)
     build = _add(verbs, "build", "Collect datasets into a folder, with cards, a table and a figure", _zoo_build)
     build.add_argument(
-        "tasks", nargs="*", metavar="TASK", help="such as hopper-medium, hopper-medium-v4, ant-medium-105d"
+        "tasks",
+        nargs="*",
+        metavar="TASK",
+        help="such as hopper-medium, hopper-medium-v4, ant-medium-105d, hopper-medium-hidden",
     )
     build.add_argument("--all", action="store_true", help="the twenty, beside those named")
     build.add_argument("--out", type=Path, default=Path("data/zoo"), metavar="DIR", help="default: data/zoo")

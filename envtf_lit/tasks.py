@@ -57,7 +57,8 @@ class Robot:
     -v5 are therefore comparable among themselves, not with D4RL's tables.
 
     `variant` is empty for the robot as the twenty tasks have it, else the suffix of its tasks' names: `-v4` for
-    Gymnasium's older simulation, `-105d` for Ant with the contact forces among its observations.
+    Gymnasium's older simulation, `-105d` for Ant with the contact forces among its observations, `-hidden` for a body
+    that is another one in each episode (see `hidden_dynamics.HiddenDynamics`).
     """
 
     name: str
@@ -82,11 +83,21 @@ class Robot:
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
-                return gymnasium.make(
+                env = gymnasium.make(
                     self.env_id, max_episode_steps=self.max_episode_steps, disable_env_checker=True, **self.env_kwargs
                 )
         finally:
             mujoco.set_mju_user_warning(None)  # pyright: ignore[reportAttributeAccessIssue]
+        if not self.hidden_dynamics:
+            return env
+        from envtf_lit.hidden_dynamics import HiddenDynamics
+
+        return HiddenDynamics(env)
+
+    @property
+    def hidden_dynamics(self) -> bool:
+        """Whether friction, mass and actuator strength are drawn anew in each episode, unobserved."""
+        return self.variant == "-hidden"
 
     def normalised_score(self, episode_return: float) -> float:
         """D4RL's score: 0 is a random policy, 100 its expert. `100 (G - G_random) / (G_expert - G_random)`."""
@@ -120,11 +131,11 @@ class Task:
 TASKS = {task.name: task for task in (Task(robot, tier) for robot in ROBOTS.values() for tier in TIERS)}
 
 
-VARIANTS = re.compile(r"(?P<task>.+?)(?P<variant>-v4|-105d)")
+VARIANTS = re.compile(r"(?P<task>.+?)(?P<variant>-v4|-105d|-hidden)")
 
 
 def get_task(name: str) -> Task:
-    """The task of that name; `-v4` and `-105d` after one of the twenty names ask for its robot's variants.
+    """The task of that name; `-v4`, `-105d` and `-hidden` after one of the twenty names ask for its robot's variants.
 
     Raises:
         UserError: there is no such task; the message holds the nearest one.
@@ -143,6 +154,8 @@ def find_task(name: str) -> Task | None:
     task = TASKS[match["task"]]
     if match["variant"] == "-v4":
         return replace(task, robot=_gymnasium_v4(task.robot))
+    if match["variant"] == "-hidden":
+        return replace(task, robot=replace(task.robot, variant="-hidden"))
     return replace(task, robot=_with_contact_forces(task.robot)) if task.robot.name == "ant" else None
 
 

@@ -210,6 +210,20 @@ def test_variants_are_driven_by_the_same_policies(name: str):
         assert np.abs(dataset.next_observations[:, 27:]).max() > 0  # contact forces
 
 
+def test_episodes_of_hidden_dynamics_differ_from_their_first_action_on_and_are_the_seeds():
+    task = get_task("walker2d-medium-hidden")
+    dataset = collect(task, 400, seed=0, workers=1, progress=False)
+    usual = collect(get_task("walker2d-medium"), 60, seed=0, workers=1, progress=False)
+    np.testing.assert_array_equal(dataset.observations[0], usual.observations[0])
+    assert np.abs(dataset.next_observations[0] - usual.next_observations[0]).max() > 1e-3
+    again = collect(task, 400, seed=0, workers=1, progress=False)
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(dataset, name), getattr(again, name))
+    origin = describe_origin(task, 400, 0)
+    assert "friction, mass and actuator strength" in origin["hidden_dynamics"]
+    assert "hidden_dynamics" not in describe_origin(TASK, ROWS, 0)
+
+
 def test_origin_names_every_policy_and_version():
     origin = describe_origin(get_task("ant-medium-expert"), 1_000, 3)
     assert [policy["transitions"] for policy in origin["policies"]] == [500, 500]

@@ -24,6 +24,7 @@ from minari.dataset.minari_storage import MinariStorage
 from envtf_lit.data.dataset import COLUMNS, OfflineDataset
 from envtf_lit.data.minari_sets import describe_minari, read_minari, write_minari
 from envtf_lit.errors import UserError
+from envtf_lit.hidden_dynamics import HiddenDynamics
 
 PLAIN = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
 ACTIONS = gym.spaces.Box(-2.0, 2.0, (1,), np.float32)
@@ -92,7 +93,12 @@ def test_what_is_written_reads_back_alike(dataset_id: str) -> None:
 @pytest.mark.filterwarnings("ignore:.*is out of date:DeprecationWarning")  # Gymnasium's advice to leave -v4
 @pytest.mark.parametrize(
     ("task", "width", "env_id"),
-    [("ant-random", 27, "Ant-v5"), ("ant-random-v4", 27, "Ant-v4"), ("ant-random-105d", 105, "Ant-v5")],
+    [
+        ("ant-random", 27, "Ant-v5"),
+        ("ant-random-v4", 27, "Ant-v4"),
+        ("ant-random-105d", 105, "Ant-v5"),
+        ("ant-random-hidden", 27, "Ant-v5"),
+    ],
 )
 def test_minari_reads_it_and_recovers_the_environment(task: str, width: int, env_id: str) -> None:
     dataset = make_dataset(task, width, 8)
@@ -104,6 +110,7 @@ def test_minari_reads_it_and_recovers_the_environment(task: str, width: int, env
     environment = theirs.recover_environment()
     assert environment.spec is not None and environment.spec.id == env_id
     assert environment.observation_space.shape == (width,)  # the robot's own options came along
+    assert isinstance(environment, HiddenDynamics) == task.endswith("-hidden")
     environment.close()
     assert read_minari("ours/ant-v0").task == task
 

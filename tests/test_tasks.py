@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from envtf_lit.errors import UserError
+from envtf_lit.hidden_dynamics import Factors, HiddenDynamics
 from envtf_lit.tasks import ROBOTS, TASKS, find_task, get_task
 
-VARIANTS = [*(f"{name}-medium-v4" for name in ROBOTS), "ant-medium-105d"]
+VARIANTS = [*(f"{name}-medium{variant}" for name in ROBOTS for variant in ("-v4", "-hidden")), "ant-medium-105d"]
 
 
 def test_there_are_twenty() -> None:
@@ -49,9 +50,63 @@ def test_the_first_dimensions_of_the_large_ant_are_those_of_the_small_one() -> N
         ("hopper-medium-v2", "hopper-medium"),  # D4RL's name
         ("hopper-medium-105d", "hopper-medium"),
         ("ant-medium-105d-v4", "ant-medium"),
+        ("ant-medium-105d-hidden", "ant-medium"),
     ],
 )
 def test_names_of_nothing_are_refused_with_a_hint(name: str, hint: str) -> None:
     assert find_task(name) is None
     with pytest.raises(UserError, match=f"{name}.*{hint}"):
         get_task(name)
+
+
+# robots whose dynamics are hidden
+
+HIDDEN = [f"{name}-medium-replay-hidden" for name in ("hopper", "halfcheetah", "walker2d")]
+
+
+def hidden(name: str) -> HiddenDynamics:
+    env = get_task(name).robot.make()
+    assert isinstance(env, HiddenDynamics)
+    return env
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_hidden_dynamics_are_drawn_anew_in_each_episode_from_the_seed(name: str) -> None:
+    env, twin = hidden(name), hidden(name)
+    assert env.factors == Factors()
+    drawn = [env.reset(seed=5) and env.factors, *(env.reset() and env.factors for _ in range(9))]
+    again = [twin.reset(seed=5) and twin.factors, *(twin.reset() and twin.factors for _ in range(9))]
+    assert drawn == again
+    values = np.array([(f.friction, f.mass, f.strength) for f in drawn])
+    assert len(np.unique(values)) == 30
+    assert 0.5 <= values.min() < 0.7 and 1.3 < values.max() <= 1.5
+    assert np.abs(values.mean() - 1.0) < 0.2
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_factors_multiply_the_nominal_robot_and_leave_the_start_as_it_is(name: str) -> None:
+    nominal, env = get_task(name.removesuffix("-hidden")).robot.make(), hidden(name)
+    start, _ = nominal.reset(seed=1)
+    np.testing.assert_array_equal(env.reset(seed=1)[0], start)
+    for _ in range(3):  # factors are of the nominal robot, not of the one before
+        env.reset()
+    plain, mine = (e.unwrapped.model for e in (nominal, env))  # pyright: ignore
+    f = env.factors
+    np.testing.assert_array_equal(mine.geom_friction, f.friction * plain.geom_friction)
+    np.testing.assert_array_equal(mine.body_mass, f.mass * plain.body_mass)
+    np.testing.assert_array_equal(mine.body_inertia, f.mass * plain.body_inertia)
+    np.testing.assert_array_equal(mine.actuator_gear, f.strength * plain.actuator_gear)
+    assert mine.body_subtreemass[0] == pytest.approx(f.mass * plain.body_subtreemass[0])  # what MuJoCo derives
+
+
+def test_with_factors_of_one_the_robot_is_the_nominal_one() -> None:
+    nominal, env = get_task("halfcheetah-medium").robot.make(), hidden("halfcheetah-medium-hidden")
+    rng = np.random.default_rng(0)
+    for e in (nominal, env):
+        e.reset(seed=2)
+    env.apply(Factors())
+    for action in rng.uniform(-1, 1, (20, 6)).astype(np.float32):
+        assert env.step(action)[0] == pytest.approx(nominal.step(action)[0], abs=1e-6)
+    env.apply(Factors(strength=0.5))
+    action = np.ones(6, np.float32)
+    assert np.abs(env.step(action)[0] - nominal.step(action)[0]).max() > 0.01

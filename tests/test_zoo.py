@@ -14,7 +14,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.tasks import TASKS
 from envtf_lit.zoo import Entry, build, catalogue
 
-NAMES = ["hopper-medium", "hopper-random", "ant-random-105d", "halfcheetah-random-v4"]
+NAMES = ["hopper-medium", "hopper-random", "ant-random-105d", "halfcheetah-random-v4", "hopper-random-hidden"]
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +41,8 @@ def test_every_dataset_has_a_card_and_a_page(out: Path) -> None:
         for policy in card["policies"]:
             assert f"| {policy['policy']} | {policy['transitions']:,} |" in page
     assert "`include_cfrc_ext_in_observation" not in (out / "ant-random-105d.md").read_text()
+    pages = {name: (out / f"{name}.md").read_text() for name in NAMES}
+    assert [name for name, page in pages.items() if "| hidden dynamics | friction, mass and" in page] == [NAMES[-1]]
     assert "HalfCheetah-v4" in (out / "halfcheetah-random-v4.md").read_text()
 
 

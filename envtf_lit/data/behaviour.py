@@ -22,6 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
 from envtf_lit.errors import UserError
+from envtf_lit.hidden_dynamics import HIGH, LOW
 from envtf_lit.policy import Policy, RandomPolicy, TanhGaussianActor
 from envtf_lit.storage import load_weights, read_json
 from envtf_lit.tasks import ROBOTS, Robot, Task
@@ -30,6 +31,10 @@ ZOO = Path(__file__).parent.parent / "assets" / "zoo"
 ENVIRONMENTS = 8  # per unit of work; a constant, since the policy's rounding may depend on the batch size
 UNIT_ROWS = 24_000  # at most, per unit of work: three episodes of 1,000 steps in each environment, so none is wasted
 MIN_ROWS = 2  # of a phase and of an episode
+HIDDEN_DYNAMICS = (
+    f"friction, mass and actuator strength are drawn in each episode, each uniform in [{LOW}, {HIGH}] times nominal, "
+    "and are not observed; the policies were trained, and their returns measured, on the nominal robot"
+)
 
 Columns = dict[str, np.ndarray]  # rows under the names in `COLUMNS`, float32 and bool
 
@@ -191,11 +196,13 @@ def describe_origin(task: Task, transitions: int, seed: int, zoo: Path | None = 
         for phase in plan(task, transitions, series)
     ]
     versions = {name: version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")}
+    hidden = {"hidden_dynamics": HIDDEN_DYNAMICS} if robot.hidden_dynamics else {}
     return {
         "seed": seed,
         "actions": "stochastic",
         "env_id": robot.env_id,
         "env_kwargs": robot.env_kwargs,
+        **hidden,
         "policies": policies,
         "trained_with": series.trained_with,
         "versions": {**versions, "python": platform.python_version()},

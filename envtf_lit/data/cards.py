@@ -9,6 +9,7 @@ def card_page(card: dict[str, Any]) -> str:
     scores, steps = card["scores"], card["episode_steps"]
     facts = {
         "environment": f"Gymnasium `{card['env_id']}`" + _arguments(card["env_kwargs"]),
+        **({"hidden dynamics": card["hidden_dynamics"]} if "hidden_dynamics" in card else {}),
         "transitions": f"{card['transitions']:,}",
         "episodes": f"{card['episodes']:,}, of which {card['terminated']:,} terminated and {card['truncated']:,} were "
         "truncated",

@@ -21,6 +21,7 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import check_size, hdf5_bytes, own_hdf5
 from envtf_lit.data.validation import build_dataset
 from envtf_lit.errors import UserError
+from envtf_lit.hidden_dynamics import HiddenDynamics
 from envtf_lit.storage import replacing
 from envtf_lit.tasks import get_task
 
@@ -307,6 +308,8 @@ def _environment(dataset: OfflineDataset) -> Any:
     robot = get_task(dataset.task).robot
     spec = copy.deepcopy(gym.spec(robot.env_id))
     spec.kwargs = spec.kwargs | robot.env_kwargs
+    if robot.hidden_dynamics:
+        spec.additional_wrappers = (HiddenDynamics.wrapper_spec(),)
     return spec
 
 
