@@ -2,7 +2,8 @@
 
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,22 @@ if TYPE_CHECKING:
     import gymnasium
 
 TIERS = ("random", "medium", "medium-replay", "medium-expert", "full-replay")
+
+
+@contextmanager
+def quiet_mujoco() -> Iterator[None]:
+    """Keeps MuJoCo's warnings off the screen and out of MUJOCO_LOG.TXT.
+
+    HalfCheetah's own model file makes MuJoCo 4 complain at each start, and every state that an imagination makes
+    impossible would be worth a line.
+    """
+    import mujoco
+
+    mujoco.set_mju_user_warning(lambda message: None)  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(None)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _all_below(observation: Tensor, limit: float) -> Tensor:
@@ -76,18 +93,12 @@ class Robot:
     def make(self) -> "gymnasium.Env":
         """The simulator, without Gymnasium's checks of our use of it and its advice to leave -v4."""
         import gymnasium
-        import mujoco
 
-        # HalfCheetah's own model file makes MuJoCo 4 complain at each start, on the screen and in MUJOCO_LOG.TXT
-        mujoco.set_mju_user_warning(lambda message: None)  # pyright: ignore[reportAttributeAccessIssue]
-        try:
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
-                env = gymnasium.make(
-                    self.env_id, max_episode_steps=self.max_episode_steps, disable_env_checker=True, **self.env_kwargs
-                )
-        finally:
-            mujoco.set_mju_user_warning(None)  # pyright: ignore[reportAttributeAccessIssue]
+        with quiet_mujoco(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
+            env = gymnasium.make(
+                self.env_id, max_episode_steps=self.max_episode_steps, disable_env_checker=True, **self.env_kwargs
+            )
         if not self.hidden_dynamics:
             return env
         from envtf_lit.hidden_dynamics import HiddenDynamics
