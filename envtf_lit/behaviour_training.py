@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, TextColumn
 from safetensors.torch import save
 
 from envtf_lit.data.behaviour import Snapshot
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.returns import evaluate_policy
 from envtf_lit.policy import TanhGaussianActor
+from envtf_lit.progress import progress_bar
 from envtf_lit.storage import replacing, write_json
 from envtf_lit.tasks import Robot
 
@@ -101,21 +101,14 @@ def train(robot: Robot, out: Path, *, algorithm: str, steps: int, seed: int, pro
         )
     model = _learner(robot, recipe, seed)
     snapshots: list[Snapshot] = []
-    with _bar(steps, robot.name, progress) as bar:
+    shown = (MofNCompleteColumn(), TextColumn("return {task.fields[reached]:.0f}"))
+    with progress_bar(f"Training {robot.name}", steps, *shown, visible=progress, reached=0.0) as update:
         while model.num_timesteps < steps:
             model.learn(min(_stretch(model.num_timesteps), steps - model.num_timesteps), reset_num_timesteps=False)
             snapshots.append(_keep(_actor(robot, model), robot, model.num_timesteps, folder))
             write_json(folder / "zoo.json", _contents(robot, recipe, seed, snapshots))
-            bar.update(bar.task_ids[0], completed=model.num_timesteps, reached=snapshots[-1].mean_return)
+            update(completed=model.num_timesteps, reached=snapshots[-1].mean_return)
     return folder
-
-
-def _bar(steps: int, title: str, visible: bool) -> Progress:
-    reached = TextColumn("return {task.fields[reached]:.0f}")
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), reached, TimeRemainingColumn())
-    bar = Progress(*columns, console=Console(stderr=True), disable=not visible)
-    bar.add_task(f"Training {title}", total=steps, reached=0.0)
-    return bar
 
 
 def _stretch(step: int) -> int:

@@ -3,7 +3,7 @@
 import math
 import multiprocessing
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -17,13 +17,12 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
 from envtf_lit.errors import UserError
 from envtf_lit.hidden_dynamics import HIGH, LOW
 from envtf_lit.policy import Policy, RandomPolicy, TanhGaussianActor
+from envtf_lit.progress import progress_bar
 from envtf_lit.storage import load_weights, read_json
 from envtf_lit.tasks import ROBOTS, Robot, Task
 
@@ -236,11 +235,11 @@ def collect(
     units = [unit for phase in plan(task, transitions, series) for unit in _units(phase)]
     starts = [0, *accumulate(unit.rows for unit in units)]
     columns = _empty_columns(task.robot, (transitions,))
-    with _progress_bar(transitions, task.name, progress) as advance:
+    with progress_bar(f"Collecting {task.name}", transitions, visible=progress) as update:
         for index, collected in _run(task.robot, series, units, seed, workers):
             for name, rows in collected.items():
                 columns[name][starts[index] : starts[index + 1]] = rows
-            advance(units[index].rows)
+            update(advance=units[index].rows)
     limit = np.full(task.robot.action_dim, task.robot.action_limit, dtype=np.float32)
     return OfflineDataset(
         **columns,
@@ -406,11 +405,3 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-@contextmanager
-def _progress_bar(total: int, title: str, visible: bool) -> Iterator[Callable[[int], None]]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not visible) as bar:
-        task = bar.add_task(f"Collecting {title}", total=total)
-        yield lambda rows: bar.advance(task, rows)

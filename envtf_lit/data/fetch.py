@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import requests
-from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from rich.progress import DownloadColumn, TransferSpeedColumn
 
 from envtf_lit.errors import DISK_FULL, UserError
+from envtf_lit.progress import progress_bar
 
 ATTEMPTS = 5  # connections in a row that bring nothing new, before a server is given up
 TIMEOUT = (10, 60)  # seconds: to connect, between two pieces
@@ -64,13 +64,12 @@ def fetch(remote: RemoteFile, path: Path, *, progress: bool = True, pause: float
         UserError: no server has the file, or the disk is full; the message names every URL and what became of it.
     """
     partial = path.with_name(f".{path.name}.partial")
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _check_space(partial, remote.size)
-        with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), disable=not progress) as bar:
-            task = bar.add_task(path.name, total=remote.size)
-            _from_any(remote, partial, pause, lambda have, text: bar.update(task, completed=have, description=text))
+        shown = (DownloadColumn(), TransferSpeedColumn())
+        with progress_bar(path.name, remote.size, *shown, visible=progress) as update:
+            _from_any(remote, partial, pause, lambda have, text: update(completed=have, description=text))
         os.replace(partial, path)
     except OSError as error:
         if error.errno in DISK_FULL:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from rich.progress import Progress
 
 from envtf_lit.errors import UserError
 from envtf_lit.policy import Policy
+from envtf_lit.progress import progress_bar
 from envtf_lit.tasks import Robot
 
 SEED_OFFSET = 1000  # keeps evaluation seeds apart from those that data was collected with
@@ -72,9 +72,8 @@ def evaluate_policy(policy: Policy, robot: Robot, *, episodes: int, seed: int, p
         raise UserError(f"A policy is scored on at least one episode: {episodes} were asked for; raise the number.")
     seeds = [seed + SEED_OFFSET + i for i in range(episodes)]
     groups = [seeds[start : start + ROWS] for start in range(0, episodes, ROWS)]
-    with Progress(disable=not progress, transient=True) as bar:
-        task = bar.add_task("episodes", total=len(groups) * robot.max_episode_steps)
-        played = [episode for group in groups for episode in _play(policy, robot, group, lambda: bar.advance(task))]
+    with progress_bar("Scoring", len(groups) * robot.max_episode_steps, visible=progress) as update:
+        played = [episode for group in groups for episode in _play(policy, robot, group, lambda: update(advance=1))]
     returns = np.array([episode.rewards.sum() for episode in played])
     return Returns(
         returns=returns,
