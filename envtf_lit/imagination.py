@@ -50,9 +50,7 @@ class Rollouts:
     def __len__(self) -> int:
         return len(self.rewards)
 
-    def returns(
-        self, rewards: Tensor, discount: float, halt_value: float | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def returns(self, rewards: Tensor, discount: float) -> tuple[Tensor, Tensor, Tensor]:
         """Multi-step transitions that run from each imagined step to the end of its rollout.
 
         Args:
