@@ -294,8 +294,14 @@ def log_of(endings: Sequence[Sequence[str]]) -> _Log:
     log = _Log(robot, len(endings))
     for step, letters in enumerate(zip(*endings, strict=True)):
         values = np.arange(len(letters)) + 10.0 * step
-        flags = (np.array([letter == mark for letter in letters]) for mark in "tc")
-        log.append(values[:, None], values[:, None], values, values[:, None] + 10, *flags)
+        log.append(
+            observations=values[:, None],
+            actions=values[:, None],
+            rewards=values,
+            next_observations=values[:, None] + 10,
+            terminated=np.array([letter == "t" for letter in letters]),
+            truncated=np.array([letter == "c" for letter in letters]),
+        )
     return log
 
 

@@ -316,7 +316,14 @@ def _act(robot: Robot, policy: Policy, rows: int, seeds: list[int], generator: t
     while log.usable_rows() <= rows:
         action = policy.act(torch.as_tensor(observation[:, :seen], dtype=torch.float32), False, generator).numpy()
         following, reward, terminated, truncated, _ = envs.step(action)
-        log.append(observation, action, reward, following, terminated, truncated & ~terminated)
+        log.append(
+            observations=observation,
+            actions=action,
+            rewards=reward,
+            next_observations=following,
+            terminated=terminated,
+            truncated=truncated & ~terminated,
+        )
         observation = following
     envs.close()
     return log.cut(rows)
@@ -356,18 +363,18 @@ class _Log:
         self.running = [_Trace(environment, 0) for environment in range(self.environments)]
         self.episodes += self.running
 
-    def append(self, *values: np.ndarray) -> None:
-        """One step of all environments: arrays (E, ...) in the order of `COLUMNS`."""
+    def append(self, **step: np.ndarray) -> None:
+        """One step of all environments: arrays (E, ...) under the names in `COLUMNS`."""
         if self.steps == len(self.columns["rewards"]):
             self.columns = {name: np.concatenate([rows, np.empty_like(rows)]) for name, rows in self.columns.items()}
-        for name, value in zip(COLUMNS, values, strict=True):
-            self.columns[name][self.steps] = value
+        for name, rows in self.columns.items():
+            rows[self.steps] = step[name]
         self.steps += 1
         for environment, trace in enumerate(self.running):
             if trace.stop is not None:  # this step was the automatic reset, which is no transition: no episode has it
                 self.running[environment] = _Trace(environment, self.steps)
                 self.episodes.append(self.running[environment])
-            elif values[-2][environment] or values[-1][environment]:
+            elif step["terminated"][environment] or step["truncated"][environment]:
                 trace.stop = self.steps
 
     def usable_rows(self) -> int:
