@@ -14,7 +14,7 @@ import numpy as np
 
 from envtf_lit.data.columns import blocks
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.fetch import RemoteFile, fetch, sha256
+from envtf_lit.data.fetch import RemoteFile, fetch, fingerprint
 from envtf_lit.data.formats import open_raw
 from envtf_lit.data.validation import build_dataset
 from envtf_lit.errors import UserError
@@ -80,10 +80,11 @@ def load_d4rl(task: Task, path: str | Path | None, *, progress: bool = True) -> 
     remote = remote_file(task)
     local = _published_copy(remote, progress) if path is None else Path(path)
     dataset, mended = read_d4rl(local, task)
-    size, digest = local.stat().st_size, sha256(local)
-    published = (size, digest) == (remote.size, remote.sha256)
-    file = {"path": str(local), "bytes": size, "sha256": digest, "published_file": published}
-    return dataset, {"url": remote.urls[0], **file, "mended": mended}
+    found = fingerprint(local)
+    published = found == {"bytes": remote.size, "sha256": remote.sha256}
+    return dataset, {
+        "url": remote.urls[0], "path": str(local), **found, "published_file": published, "mended": mended
+    }  # fmt: skip
 
 
 def remote_file(task: Task) -> RemoteFile:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import requests
 from rich.progress import DownloadColumn, TransferSpeedColumn
@@ -45,6 +46,11 @@ def sha256(path: Path) -> str:
     """The SHA-256 sum of a file, in hexadecimal digits."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def fingerprint(path: Path) -> dict[str, Any]:
+    """By which a file is known again, for a card: `bytes` and `sha256`."""
+    return {"bytes": path.stat().st_size, "sha256": sha256(path)}
 
 
 def fetch(remote: RemoteFile, path: Path, *, progress: bool = True, pause: float = 1.0) -> None:

@@ -6,7 +6,6 @@ its user asks for it, never here.
 
 import contextlib
 import copy
-import hashlib
 import json
 import sys
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ import h5py
 import numpy as np
 
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.fetch import fingerprint
 from envtf_lit.data.formats import check_size, hdf5_bytes, own_hdf5
 from envtf_lit.data.validation import build_dataset
 from envtf_lit.errors import UserError
@@ -73,8 +73,7 @@ def describe_minari(id_or_path: str | Path) -> dict[str, Any]:
     facts = {"minari_id": metadata.get("dataset_id"), "collected_in": environment, "path": str(folder)}
     facts |= {name: metadata[name] for name in FACTS if name in metadata}
     if (file := folder / HDF5_FILE).is_file():
-        with file.open("rb") as stream:
-            facts |= {"bytes": file.stat().st_size, "sha256": hashlib.file_digest(stream, "sha256").hexdigest()}
+        facts |= fingerprint(file)
     return facts
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from envtf_lit.data.behaviour import collect, describe_origin
 from envtf_lit.data.d4rl import load_d4rl
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.fetch import sha256
+from envtf_lit.data.fetch import fingerprint
 from envtf_lit.data.formats import load_dataset
 from envtf_lit.data.minari_sets import describe_minari, read_minari
 from envtf_lit.params import DownloadOptions
@@ -63,9 +63,8 @@ def make_dataset(
             return _renamed(dataset, name), describe_minari(options.minari_id) | {"note": MINARI_NOTE}
         case "file":
             assert options.path is not None
-            path = Path(options.path)
-            dataset = load_dataset(path, task=name)
-            return _renamed(dataset, name), {"path": options.path, "bytes": path.stat().st_size, "sha256": sha256(path)}
+            dataset = load_dataset(options.path, task=name)
+            return _renamed(dataset, name), {"path": options.path, **fingerprint(Path(options.path))}
 
 
 def _renamed(dataset: OfflineDataset, name: str | None) -> OfflineDataset:
