@@ -11,7 +11,6 @@ With MUJOCO_GL set to `egl` or `osmesa` MuJoCo renders; with `disabled` the link
 import os
 import sys
 
-import gymnasium
 import mujoco
 import numpy as np
 from PIL import Image, ImageDraw
@@ -82,11 +81,10 @@ def _capsule(pen: ImageDraw.ImageDraw, start: tuple, end: tuple, radius: float, 
 
 
 def main(source: str, target: str) -> None:
-    """Reads `env_id`, `positions` (F, Q) and `size`, writes `frames` (F, size, size, 3)."""
+    """Reads `model` (path of an MJCF file), `positions` (F, Q) and `size`, writes `frames` (F, size, size, 3)."""
     with np.load(source, allow_pickle=False) as given:
-        env_id, positions, size = str(given["env_id"]), given["positions"], int(given["size"])
-    env = gymnasium.make(env_id, disable_env_checker=True)
-    model = env.unwrapped.model
+        path, positions, size = str(given["model"]), given["positions"], int(given["size"])
+    model = mujoco.MjModel.from_xml_path(path)
     paint = draw if os.environ.get("MUJOCO_GL") == "disabled" else render
     np.savez_compressed(target, frames=paint(model, positions, size))
 

@@ -6,8 +6,8 @@ import sys
 import tempfile
 from functools import cache
 from pathlib import Path
+from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
@@ -90,35 +90,26 @@ def imagined_positions(robot: Robot, states: np.ndarray, start: np.ndarray) -> n
     Observations leave out where on the plane the robot is: the first coordinate of our planar robots, two of Ant's.
     They are integrated from the velocities. States that are not finite repeat the last finite one.
     """
-    hidden = len(start) + _velocities(robot) - states.shape[1]
+    simulator = _simulator(robot)
+    hidden = len(start) + simulator.model.nv - states.shape[1]
     finite = np.isfinite(states).all(1)
     states = states[np.maximum.accumulate(np.where(finite, np.arange(len(states)), 0))]
     seen = len(start) - hidden
     velocity = states[1:, seen : seen + hidden]
-    plane = start[:hidden] + np.concatenate([np.zeros((1, hidden)), np.cumsum(_time_step(robot) * velocity, axis=0)])
+    plane = start[:hidden] + np.concatenate([np.zeros((1, hidden)), np.cumsum(simulator.dt * velocity, axis=0)])
     return np.concatenate([plane, states[:, :seen]], axis=1)
 
 
-@cache
-def _simulator(robot_env_id: str) -> tuple[int, float]:
-    env = gymnasium.make(robot_env_id, disable_env_checker=True)
-    raw = env.unwrapped
-    return raw.model.nv, raw.dt  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _velocities(robot: Robot) -> int:
-    return _simulator(robot.env_id)[0]
-
-
-def _time_step(robot: Robot) -> float:
-    return _simulator(robot.env_id)[1]
+def _simulator(robot: Robot) -> Any:
+    """Gymnasium's own environment, without wrappers: it knows the model, its file and the time of a step."""
+    return robot.make().unwrapped
 
 
 def _render(robot: Robot, positions: np.ndarray, size: int, backend: str) -> np.ndarray:
     """Frames (F, size, size, 3) from a child process whose MuJoCo uses this back-end."""
     with tempfile.TemporaryDirectory() as folder:
         source, target = f"{folder}/poses.npz", f"{folder}/frames.npz"
-        np.savez(source, env_id=robot.env_id, positions=positions, size=size)
+        np.savez(source, model=_simulator(robot).fullpath, positions=positions, size=size)
         subprocess.run(
             [sys.executable, "-m", "envtf_lit.figures.render", source, target],
             env=os.environ | {"MUJOCO_GL": backend},
