@@ -10,7 +10,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.evaluation.returns import Episode, evaluate_policy
 from envtf_lit.figures import video
 from envtf_lit.policy import RandomPolicy
-from envtf_lit.tasks import ROBOTS
+from envtf_lit.tasks import ROBOTS, Robot, get_task
 from envtf_lit.world_models.horizon import Scale
 
 HOPPER = ROBOTS["hopper"]
@@ -22,8 +22,7 @@ def still_world(factor: float = 1.0) -> LinearWorld:
     return LinearWorld(factor * torch.eye(11), torch.zeros(11, 3), observation_dim=11, action_dim=3)
 
 
-def random_episode(name: str) -> Episode:
-    robot = ROBOTS[name]
+def random_episode(robot: Robot) -> Episode:
     torch.manual_seed(0)
     limit = robot.action_limit * torch.ones(robot.action_dim)
     return evaluate_policy(RandomPolicy(-limit, limit), robot, episodes=1, seed=0, progress=False).median
@@ -31,7 +30,7 @@ def random_episode(name: str) -> Episode:
 
 @pytest.fixture(scope="module")
 def episode() -> Episode:
-    return random_episode("hopper")
+    return random_episode(HOPPER)
 
 
 def test_positions_follow_from_observations(episode):
@@ -40,10 +39,11 @@ def test_positions_follow_from_observations(episode):
     np.testing.assert_allclose(positions[:, 0], episode.positions[:, 0], atol=0.01)
 
 
-@pytest.mark.parametrize("name", ["walker2d", "ant"])
-def test_positions_of_other_robots(name):
-    played = random_episode(name)
-    positions = video.imagined_positions(ROBOTS[name], played.observations[:20], played.positions[0])
+@pytest.mark.parametrize("task", ["walker2d-random", "ant-random", "ant-random-105d"])
+def test_positions_of_other_robots(task):
+    robot = get_task(task).robot
+    played = random_episode(robot)
+    positions = video.imagined_positions(robot, played.observations[:20], played.positions[0])
     np.testing.assert_allclose(positions, played.positions[:20], atol=0.05)
 
 

@@ -91,7 +91,7 @@ def imagined_positions(robot: Robot, states: np.ndarray, start: np.ndarray) -> n
     They are integrated from the velocities. States that are not finite repeat the last finite one.
     """
     simulator = _simulator(robot)
-    hidden = len(start) + simulator.model.nv - states.shape[1]
+    hidden = len(start) + simulator.model.nv - ROBOTS[robot.name].observation_dim  # without what a variant adds
     finite = np.isfinite(states).all(1)
     states = states[np.maximum.accumulate(np.where(finite, np.arange(len(states)), 0))]
     seen = len(start) - hidden
