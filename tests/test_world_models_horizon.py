@@ -5,6 +5,7 @@ import pytest
 import torch
 from analytic import linear_data, linear_world
 
+from envtf_lit.errors import UserError
 from envtf_lit.world_models.horizon import (
     Scale,
     forecast,
@@ -87,6 +88,35 @@ def test_selection_prefers_the_better_model_and_is_finite_for_all():
     errors = [open_loop_error(linear_world(error), batch, scale) for error in (0.0, 0.01, 0.1, 1.0)]
     assert errors == sorted(errors)
     assert np.isfinite(errors).all()
+
+
+def test_an_open_loop_after_history_is_taught_first_and_then_on_its_own():
+    data, model = linear_data((20, 20), noise=0.01), linear_world(error=0.03)
+    trajectories = whole_episodes(data, 2, seed=0)
+    taught, warm, cold = (
+        forecast(model, trajectories, feedback=feedback, history=history).mean
+        for feedback, history in (("recorded", 0), ("imagined", 7), ("imagined", 0))
+    )
+    assert torch.equal(warm[:, :8], taught[:, :8])  # the step from the true state 7 is the first of its own
+    assert not torch.equal(warm[:, 8:], taught[:, 8:])
+    late = segments(data, 1, 13, seed=0, whole=True)  # memory is none of this model's: only where it starts counts
+    begin = data.episode_starts + 7
+    for episode, row in enumerate(begin):
+        late.observations[0], late.actions[0] = (
+            torch.as_tensor(column[row : row + 13]) for column in (data.observations, data.actions)
+        )
+        torch.testing.assert_close(forecast(model, late, feedback="imagined").mean[0], warm[episode, 7:])
+    assert not torch.equal(warm[:, 7:], cold[:, 7:])
+
+
+def test_whole_segments_leave_out_rows_too_near_the_end():
+    data = linear_data((5, 12, 8))
+    whole = segments(data, 50, 8, seed=0, whole=True)
+    assert whole.lengths.tolist() == [8] * 50
+    first = {row.tobytes() for row in whole.observations[:, 0].numpy()}
+    assert first == {data.observations[row].tobytes() for row in [*range(5, 10), 17]}
+    with pytest.raises(UserError, match="No episode has the 13 steps"):
+        segments(data, 1, 13, seed=0, whole=True)
 
 
 def test_segments_never_cross_an_episode():

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.errors import UserError
 from envtf_lit.world_models.interface import Prediction, WorldModel
 from envtf_lit.world_models.normaliser import CONSTANT
 
@@ -90,11 +91,20 @@ def whole_episodes(dataset: OfflineDataset, count: int, *, seed: int) -> Traject
     return _cut(dataset, dataset.episode_starts[chosen], dataset.episode_lengths[chosen])
 
 
-def segments(dataset: OfflineDataset, count: int, length: int, *, seed: int) -> Trajectories:
-    """`count` stretches of `length` steps (fewer where the episode ends) from rows drawn at random."""
-    starts = np.random.default_rng(seed).integers(len(dataset), size=count)
-    left = dataset.episode_ends[dataset.episode_index[starts]] - starts
-    return _cut(dataset, starts, np.minimum(left, length))
+def segments(dataset: OfflineDataset, count: int, length: int, *, seed: int, whole: bool = False) -> Trajectories:
+    """`count` stretches of `length` steps from rows drawn at random.
+
+    Where the episode ends they have fewer steps, unless `whole` leaves out the rows that have fewer to follow.
+
+    Raises:
+        UserError: no episode is so long.
+    """
+    left = dataset.episode_ends[dataset.episode_index] - np.arange(len(dataset))
+    rows = np.flatnonzero(left >= (length if whole else 1))
+    if len(rows) == 0:
+        raise UserError(f"No episode has the {length} steps that are asked for: take data with longer ones.")
+    starts = rows[np.random.default_rng(seed).integers(len(rows), size=count)]
+    return _cut(dataset, starts, np.minimum(left[starts], length))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +121,9 @@ class Forecast:
 
 
 @torch.no_grad()
-def forecast(model: WorldModel, trajectories: Trajectories, *, feedback: Literal["imagined", "recorded"]) -> Forecast:
+def forecast(
+    model: WorldModel, trajectories: Trajectories, *, feedback: Literal["imagined", "recorded"], history: int = 0
+) -> Forecast:
     """Runs the model along the recorded actions from the first recorded state alone (context 1), with mean predictions.
 
     Args:
@@ -119,6 +131,8 @@ def forecast(model: WorldModel, trajectories: Trajectories, *, feedback: Literal
         trajectories: what really happened.
         feedback: `imagined` feeds each predicted state back (open loop, no clipping); `recorded` shows the model the
             true state before every step, so that it predicts one step ahead with the true history (teacher forcing).
+        history: leading steps in which the model is shown the true states in any case; the open loop begins behind
+            them, at the true state, with this much history.
     """
     rows = torch.argsort(trajectories.lengths, descending=True, stable=True)
     running = trajectories.valid.sum(0).tolist()  # trajectories that last until each step
@@ -130,7 +144,7 @@ def forecast(model: WorldModel, trajectories: Trajectories, *, feedback: Literal
         if running[t] <= len(rows) // 2:  # most have ended: go on with the others
             rows = rows[: running[t]]
             state = model.gather(state, torch.arange(len(rows), device=rows.device))
-        if feedback == "recorded" and t > 0:
+        if t > 0 and (feedback == "recorded" or t <= history):
             state = model.observe(state, trajectories.observations[rows, t])
         state, prediction = model.step(state, trajectories.actions[rows, t], mode="mean")
         mean[rows, t] = prediction.mean
