@@ -8,6 +8,7 @@ from analytic import linear_data, linear_world
 from envtf_lit.errors import UserError
 from envtf_lit.world_models.horizon import (
     Scale,
+    error_quartiles,
     forecast,
     horizon_report,
     nmse,
@@ -52,6 +53,29 @@ def test_errors_equal_those_computed_by_hand(feedback, name):
     for episode, length in enumerate((20, 35)):
         expected = by_hand(model, data, episode, feedback=feedback)
         np.testing.assert_allclose(error[episode, :length].numpy(), expected, rtol=2e-3, atol=1e-9)
+
+
+def test_a_sampled_forecast_feeds_its_draws_back():
+    data, scale = linear_data((40, 40)), Scale.of(linear_data((40, 40)))
+    trajectories, model = whole_episodes(data, 2, seed=0), linear_world(std=0.05)
+
+    def draw(seed: int) -> torch.Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        return forecast(model, trajectories, feedback="imagined", mode="sample", generator=generator).mean
+
+    assert torch.equal(draw(0), draw(0)) and not torch.equal(draw(0), draw(1))
+    error = nmse(draw(0), trajectories, scale)
+    assert error[:, 20:].mean() > 3 * error[:, 0].mean() > 0  # a random walk leaves the record, where the mean keeps it
+    assert nmse(forecast(model, trajectories, feedback="imagined").mean, trajectories, scale).max() < 1e-8
+
+
+def test_quartiles_count_those_that_last():
+    error = torch.arange(1.0, 7.0)[:, None] * torch.tensor([1.0, 1e9, 1e-12, 1.0])
+    found = error_quartiles(error, torch.tensor([4, 3, 3, 3, 3, 1]))
+    assert found["step"].tolist() == [1, 2, 3]  # the fourth step has one trajectory left
+    assert found["trajectories"].tolist() == [6, 5, 5]
+    assert found["median"].tolist() == [3.5, 1e8, 1e-8]
+    np.testing.assert_allclose([found["lower"][0], found["upper"][0]], [2.25, 4.75])
 
 
 def test_open_loop_drifts_where_teacher_forcing_does_not():

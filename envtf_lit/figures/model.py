@@ -9,10 +9,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from envtf_lit.evaluation.calibration import coverage
 from envtf_lit.figures.style import COLOURS, drawing, featured, observation_labels, write_table
-from envtf_lit.world_models.horizon import HorizonReport, Scale, steps_within
-
-FEWEST = 5  # trajectories that a quartile is drawn from
-SMALLEST = 1e-8  # errors are drawn on a logarithmic axis, from here up
+from envtf_lit.world_models.horizon import HorizonReport, Scale, error_quartiles, steps_within
 
 
 def horizon_errors(report: HorizonReport, path: str | Path) -> Path:
@@ -21,7 +18,7 @@ def horizon_errors(report: HorizonReport, path: str | Path) -> Path:
     tables = []
     with drawing(path, (10.5, 4.0), 1, 2) as (figure, axes):
         for axis, (name, (error, colour)) in zip(axes.flat, runs.items(), strict=True):
-            table = _quartiles(error.cpu().numpy(), report.trajectories.lengths.cpu().numpy())
+            table = pd.DataFrame(error_quartiles(error, report.trajectories.lengths))
             axis.fill_between(
                 table["step"],
                 table["lower"],
@@ -42,16 +39,6 @@ def horizon_errors(report: HorizonReport, path: str | Path) -> Path:
         figure.suptitle(f"Error on {len(report.trajectories.lengths)} held-out episodes (those that last h steps)")
     write_table(path, pd.concat(tables))
     return Path(path)
-
-
-def _quartiles(error: np.ndarray, lengths: np.ndarray) -> pd.DataFrame:
-    enough = min(FEWEST, len(lengths))
-    last = int(np.sort(lengths)[-enough])  # so many trajectories last that long
-    rows = []
-    for h in range(1, last + 1):
-        values = np.clip(error[lengths >= h, h - 1], SMALLEST, 1e8)
-        rows.append((h, *np.quantile(values, (0.25, 0.5, 0.75)), len(values)))
-    return pd.DataFrame(rows, columns=["step", "lower", "median", "upper", "trajectories"])
 
 
 def one_step_predictions(report: HorizonReport, robot: str | None, path: str | Path, *, points: int = 2000) -> Path:

@@ -15,12 +15,14 @@ from torch import Tensor
 from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
-from envtf_lit.world_models.interface import Prediction, WorldModel
+from envtf_lit.world_models.interface import Mode, Prediction, WorldModel
 from envtf_lit.world_models.normaliser import CONSTANT
 
 THRESHOLDS = (0.01, 0.1)
 HORIZONS = (1, 5, 10, 50, 100, 500, 1000)
 EXPLODED = 10.0  # nmse beyond which a rollout has left anything that the data holds
+FEWEST = 5  # trajectories that a quartile is drawn from
+SMALLEST, LARGEST = 1e-8, 1e8  # curves of errors are drawn on a logarithmic axis, within these
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +114,7 @@ class Forecast:
     """Predictions along trajectories, in the data's units; what stands in the padding means nothing.
 
     Attributes:
-        mean: (B, T, S + 1) of the next observation and, last, the reward.
+        mean: (B, T, S + 1) of the next observation and, last, the reward; their draws, if sampled.
         std: (B, T, S + 1), `sqrt(aleatoric^2 + epistemic^2)`, of that one step given the state it started from.
     """
 
@@ -122,9 +124,15 @@ class Forecast:
 
 @torch.no_grad()
 def forecast(
-    model: WorldModel, trajectories: Trajectories, *, feedback: Literal["imagined", "recorded"], history: int = 0
+    model: WorldModel,
+    trajectories: Trajectories,
+    *,
+    feedback: Literal["imagined", "recorded"],
+    history: int = 0,
+    mode: Mode = "mean",
+    generator: torch.Generator | None = None,
 ) -> Forecast:
-    """Runs the model along the recorded actions from the first recorded state alone (context 1), with mean predictions.
+    """Runs the model along the recorded actions from the first recorded state alone (context 1).
 
     Args:
         model: any world model, in eval mode, on the trajectories' device.
@@ -133,6 +141,8 @@ def forecast(
             true state before every step, so that it predicts one step ahead with the true history (teacher forcing).
         history: leading steps in which the model is shown the true states in any case; the open loop begins behind
             them, at the true state, with this much history.
+        mode: predictions are the mean's, or draws from the predictive distribution.
+        generator: of those draws.
     """
     rows = torch.argsort(trajectories.lengths, descending=True, stable=True)
     running = trajectories.valid.sum(0).tolist()  # trajectories that last until each step
@@ -146,8 +156,9 @@ def forecast(
             state = model.gather(state, torch.arange(len(rows), device=rows.device))
         if t > 0 and (feedback == "recorded" or t <= history):
             state = model.observe(state, trajectories.observations[rows, t])
-        state, prediction = model.step(state, trajectories.actions[rows, t], mode="mean")
-        mean[rows, t] = prediction.mean
+        state, prediction = model.step(state, trajectories.actions[rows, t], mode=mode, generator=generator)
+        sampled = torch.cat([prediction.observation, prediction.reward[:, None]], dim=-1)
+        mean[rows, t] = prediction.mean if mode == "mean" else sampled
         std[rows, t] = _total_std(prediction)
     return Forecast(mean, std)
 
@@ -193,6 +204,14 @@ class Steps:
     median: float
     censored: float
 
+    @classmethod
+    def within(cls, error: Tensor, lengths: Tensor, threshold: float) -> "Steps":
+        """Of trajectories with these errors, as `steps_within` takes them."""
+        steps, censored = steps_within(error, lengths, threshold)
+        values = steps.double().cpu().numpy()
+        spread = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+        return cls(float(values.mean()), float(spread), float(np.median(values)), float(censored.double().mean()))
+
 
 def steps_within(error: Tensor, lengths: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
     """`L = min{h >= 1: nmse_h > threshold} - 1` of each trajectory, or its length where no step exceeds.
@@ -211,11 +230,20 @@ def steps_within(error: Tensor, lengths: Tensor, threshold: float) -> tuple[Tens
     return first, ~exceeds.any(1)
 
 
-def _summary(error: Tensor, lengths: Tensor, threshold: float) -> Steps:
-    steps, censored = steps_within(error, lengths, threshold)
-    values = steps.double().cpu().numpy()
-    spread = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
-    return Steps(float(values.mean()), float(spread), float(np.median(values)), float(censored.double().mean()))
+def error_quartiles(error: Tensor, lengths: Tensor) -> dict[str, np.ndarray]:
+    """Quartiles of the errors (B, T) by step, over the trajectories that last so long, while five or more do.
+
+    Returns:
+        Columns (H,) `step`, `lower`, `median`, `upper`, bounded to [1e-8, 1e8], and `trajectories`.
+    """
+    values, lasting = error.cpu().numpy(), lengths.cpu().numpy()
+    last = int(np.sort(lasting)[-min(FEWEST, len(lasting))])
+    quartiles, counts = np.empty((last, 3)), np.empty(last, np.int64)
+    for h in range(1, last + 1):
+        running = np.clip(values[lasting >= h, h - 1], SMALLEST, LARGEST)
+        quartiles[h - 1], counts[h - 1] = np.quantile(running, (0.25, 0.5, 0.75)), len(running)
+    lower, median, upper = quartiles.T
+    return dict(step=np.arange(1, last + 1), lower=lower, median=median, upper=upper, trajectories=counts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,8 +283,8 @@ def horizon_report(
     reached = [h for h in HORIZONS if bool((lengths >= h).any())]
     return HorizonReport(
         nmse_one_step=float(forced[valid].mean()),
-        open_loop={threshold: _summary(free, lengths, threshold) for threshold in thresholds},
-        teacher_forced={threshold: _summary(forced, lengths, threshold) for threshold in thresholds},
+        open_loop={threshold: Steps.within(free, lengths, threshold) for threshold in thresholds},
+        teacher_forced={threshold: Steps.within(forced, lengths, threshold) for threshold in thresholds},
         median_nmse={h: float(np.median(free[lengths >= h, h - 1].cpu().numpy())) for h in reached},
         explosion_rate=float(((free > EXPLODED) & valid).any(1).double().mean()),
         trajectories=trajectories,
