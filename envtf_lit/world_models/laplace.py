@@ -12,6 +12,7 @@ RIDGE = 1e-2  # lambda: the prior's precision, in units of the (unweighted) nois
 CLUSTERS, LLOYD_ITERATIONS = 10, 20
 SCALES = torch.logspace(-4, 8, 121, dtype=torch.float64)  # candidates for c
 OUTSIDE = 0.999  # quantile of the training tokens' leverage beyond which a token counts as new
+BLOCK = 4_096  # tokens whose likelihoods are computed at a time
 
 
 class LastLayerLaplace(nn.Module):
@@ -68,18 +69,19 @@ class LastLayerLaplace(nn.Module):
             targets, mean, aleatoric: (N, K) what they should predict, what they do, with which variance; unit scale.
             groups: (N,) int64, such as `clusters` gives.
         """
-        tokens, targets, aleatoric = _with_one(hidden).double(), targets.double(), aleatoric.double()
+        tokens, targets = _with_one(hidden).double(), targets.double()
         residual = (targets - mean).square().mean(0)  # (K,)
         gram, moment = tokens.T @ tokens, tokens.T @ targets
         surprise = torch.zeros_like(SCALES)
         for group in groups.unique():
-            mine = groups == group
+            mine = (groups == group).nonzero()[:, 0]
             own = tokens[mine]
             root = _root(gram - own.T @ own)
             solution = root.T @ (root @ (moment - own.T @ targets[mine]))  # (D + 1, K), ridge regression
-            squared = (targets[mine] - own @ solution).square()
-            spread = (own @ root.T).square().sum(-1)[:, None] * residual
-            surprise += _surprise(squared, aleatoric[mine], spread)
+            for rows in mine.split(BLOCK):
+                squared = (targets[rows] - tokens[rows] @ solution).square()
+                spread = (tokens[rows] @ root.T).square().sum(-1)[:, None] * residual
+                surprise += _surprise(squared, aleatoric[rows].double(), spread)
         root = _root(gram)
         self.root.copy_(root)
         self.residual.copy_(residual)

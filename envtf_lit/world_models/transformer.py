@@ -237,8 +237,10 @@ class EnvironmentTransformer(nn.Module):
             token = self.normaliser.token(batch["observations"], batch["actions"])
             parts.append([column[valid] for column in (hidden.float(), target, token)])
         hidden, target, token = (torch.cat(columns) for columns in zip(*parts, strict=True))
+        del parts
+        groups = clusters(token, generator)
         mean, log_variance, _ = self.heads(hidden)
-        self.laplace.fit(hidden, target, mean, log_variance.exp(), clusters(token, generator))
+        self.laplace.fit(hidden, target, mean, log_variance.exp(), groups)
 
     def init(
         self,
