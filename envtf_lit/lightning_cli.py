@@ -85,7 +85,7 @@ class Publish(Callback):
             return
         folder = _folder(trainer) / "published"
         if isinstance(pl_module, LitWorldModel):
-            pl_module.fit_epistemic(trainer.datamodule)  # pyright: ignore[reportAttributeAccessIssue]
+            pl_module.fit_uncertainty(trainer.datamodule)  # pyright: ignore[reportAttributeAccessIssue]
             save_world_model(folder, pl_module.model)
         elif isinstance(pl_module, CQL):
             save_policy(folder, pl_module.average_actor)

@@ -74,7 +74,7 @@ def train_model(params: Params, root: Path = Path("."), *, progress: bool = True
             monitor="val/open_loop_error",
             gradient_clip=options.gradient_clip,
         )
-        lit.fit_epistemic(data)
+        lit.fit_uncertainty(data)
         best = min(curves.rows, key=lambda row: row["val/open_loop_error"])
         metrics = {
             "parameters": sum(p.numel() for p in lit.model.parameters()),
@@ -216,6 +216,7 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
     from envtf_lit.imagination import load_rollouts
     from envtf_lit.policy import load_policy
     from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
+    from envtf_lit.world_models.recalibration import calibration_split
     from envtf_lit.world_models.store import load_world_model
 
     options, robot = params.evaluate, _robot(params)
@@ -223,6 +224,7 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         dataset, rollouts = load_dataset(root / DATASET), load_rollouts(root / ROLLOUTS)
         model = load_world_model(root / WORLD_MODEL)
         training, held_out = dataset.split(params.train_model.held_out, seed=params.seed)
+        _, held_out = calibration_split(held_out)
         scale = Scale.of(training)
         report = horizon_report(model, whole_episodes(held_out, options.trajectories, seed=params.seed), scale)
         folders = {"bc": BEHAVIOUR, **{name: POLICIES / name for name in ALGORITHMS}}

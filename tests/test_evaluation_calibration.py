@@ -4,8 +4,9 @@ import pytest
 import torch
 from analytic import linear_data, linear_world
 
-from envtf_lit.evaluation.calibration import coverage, standardised_residuals
+from envtf_lit.evaluation.calibration import coverage
 from envtf_lit.world_models.horizon import Scale, forecast, whole_episodes
+from envtf_lit.world_models.recalibration import standardised_residuals
 
 NOISE = 0.05
 

@@ -11,11 +11,13 @@ from torch import Tensor
 from envtf_lit.data.loaders import WindowData, epoch_generator
 from envtf_lit.params import ModelOptions, TrainModelOptions
 from envtf_lit.storage import load_weights
-from envtf_lit.world_models.horizon import Scale, open_loop_error, segments
+from envtf_lit.world_models.horizon import Scale, open_loop_error, segments, whole_episodes
+from envtf_lit.world_models.recalibration import calibration_split
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 SELECTION_SEGMENTS, SELECTION_HORIZON = 256, 20  # open-loop stretches by which models are selected
 EPISTEMIC_TOKENS = 100_000  # training rows that the last layer's posterior is fitted to, at most
+CALIBRATION_EPISODES = 50  # held-out episodes that the predicted variances are scaled by, at most
 
 
 class LitWorldModel(L.LightningModule):
@@ -55,10 +57,16 @@ class LitWorldModel(L.LightningModule):
         self.scale = Scale.of(data.train, self.device)
         self.segments = segments(data.held_out, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=self.seed).to(self.device)
 
-    def fit_epistemic(self, data: WindowData) -> None:
-        """Fits the model's epistemic variance to the training windows that `data` was set up with; once, at the end."""
+    def fit_uncertainty(self, data: WindowData) -> None:
+        """Fits the epistemic variance to training windows, then both variances' scale to half the held-out episodes.
+
+        Once, at the end, with `data` set up.
+        """
         batches = data.training_tiles(EPISTEMIC_TOKENS)
         self.model.eval().fit_epistemic(batches, generator=epoch_generator(self.seed, 0, "clusters"))
+        calibration, _ = calibration_split(data.held_out)
+        if calibration is not None:
+            self.model.recalibrate(whole_episodes(calibration, CALIBRATION_EPISODES, seed=self.seed))
 
     def on_train_epoch_start(self) -> None:
         # one stream per epoch, for dropout as for sampling: a resumed run draws what an uninterrupted one would have

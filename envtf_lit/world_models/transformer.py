@@ -15,10 +15,12 @@ from torch.nn import functional as F
 
 from envtf_lit.errors import UserError
 from envtf_lit.params import ModelOptions
+from envtf_lit.world_models.horizon import Trajectories, forecast
 from envtf_lit.world_models.interface import Mode, Prediction
 from envtf_lit.world_models.laplace import LastLayerLaplace, clusters
 from envtf_lit.world_models.normaliser import Normaliser
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
+from envtf_lit.world_models.recalibration import standardised_residuals, variance_factor
 
 LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -14.0, 4.0
 
@@ -125,9 +127,15 @@ class EnvironmentTransformer(nn.Module):
     paper's third head. A score of the outcome sees only the sum of the two variances, so how such a head splits it is
     arbitrary; it is there to reproduce the paper.
 
+    Attributes:
+        recalibration: (S + 1,) factor of both predicted variances, one until `recalibrate`; the loss knows nothing of
+            it.
+
     Raises:
         UserError: `heads` does not divide `width` into even parts, or `paper_mse` lacks its third head.
     """
+
+    recalibration: Tensor
 
     def __init__(self, observation_dim: int, action_dim: int, **options: Any) -> None:
         super().__init__()
@@ -148,6 +156,7 @@ class EnvironmentTransformer(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, (3 if self.has_epistemic_head else 2) * (observation_dim + 1))
         self.laplace = LastLayerLaplace(width, observation_dim + 1) if self.options.epistemic == "laplace" else None
+        self.register_buffer("recalibration", torch.ones(observation_dim + 1))
         self.apply(_initialise)
         for block in self._stack():  # residual branches start small: sum of 2L terms keeps unit scale (GPT-2)
             for weight in (block.attention.out.weight, block.mlp[2].weight):
@@ -242,6 +251,18 @@ class EnvironmentTransformer(nn.Module):
         mean, log_variance, _ = self.heads(hidden)
         self.laplace.fit(hidden, target, mean, log_variance.exp(), groups)
 
+    def recalibrate(self, trajectories: Trajectories) -> None:
+        """Fits `recalibration` to episodes kept out of training.
+
+        Not of the paper's objective, whose collapsed variances are what it is there to show.
+        """
+        if self.options.objective == "paper_mse":
+            return
+        self.recalibration.fill_(1.0)
+        trajectories = trajectories.to(self.recalibration.device)
+        taught = forecast(self, trajectories, feedback="recorded")
+        self.recalibration.copy_(variance_factor(standardised_residuals(taught, trajectories)))
+
     def init(
         self,
         observations: Tensor,
@@ -330,10 +351,13 @@ class EnvironmentTransformer(nn.Module):
         elif self.laplace is not None:
             leverage = self.laplace.leverage(hidden.float())
             epistemic, novelty = self.laplace.variance(leverage), leverage / self.laplace.limit
-        variance = log_variance.exp() if epistemic is None else log_variance.exp() + epistemic
+        aleatoric = log_variance.exp() * self.recalibration
+        epistemic = None if epistemic is None else epistemic * self.recalibration
+        variance = aleatoric if epistemic is None else aleatoric + epistemic
         value, spread = mean, variance
         if drawn is not None:
-            value, spread = mean + self._posterior().deviation(hidden.float(), drawn), log_variance.exp()
+            deviation = self._posterior().deviation(hidden.float(), drawn)
+            value, spread = mean + deviation * self.recalibration.sqrt(), aleatoric
         if mode == "sample":
             noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
             value = value + spread.sqrt() * noise
@@ -342,7 +366,7 @@ class EnvironmentTransformer(nn.Module):
             observation=outcome[..., :-1],
             reward=outcome[..., -1],
             mean=self.normaliser.outcome(observation, mean),
-            aleatoric=torch.exp(0.5 * log_variance) * scale,
+            aleatoric=aleatoric.sqrt() * scale,
             epistemic=None if epistemic is None else epistemic.sqrt() * scale,
             uncertainty=self._uncertainty(variance),
             novelty=novelty,
