@@ -3,13 +3,14 @@
 import json
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
+from jsonargparse import Namespace
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from rich.console import Console
@@ -20,7 +21,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.params import PolicyOptions, TrainModelOptions
 from envtf_lit.policy import save_policy
 from envtf_lit.storage import replacing
-from envtf_lit.world_models.lit import LitWorldModel
+from envtf_lit.world_models.lit import LitWorldModel, lit_world_model, window_options
 from envtf_lit.world_models.store import save_world_model
 
 TRUST = (
@@ -41,7 +42,7 @@ def world_model(
     seed: int = 0,
     init_from: str | None = None,
 ) -> LitWorldModel:
-    """Environment Transformer, trained on windows of a log.
+    """Environment Transformer, or the usual ensemble, trained on windows of a log.
 
     Args:
         observation_dim: S, taken from the data.
@@ -50,7 +51,7 @@ def world_model(
         seed: of dropout and of sampled objectives.
         init_from: a published model folder (as models/world_model) whose weights and scales to start from.
     """
-    return LitWorldModel(observation_dim, action_dim, options, seed, init_from)
+    return lit_world_model(observation_dim, action_dim, options, seed, init_from)
 
 
 def agent(
@@ -86,7 +87,7 @@ class Publish(Callback):
         folder = _folder(trainer) / "published"
         if isinstance(pl_module, LitWorldModel):
             pl_module.fit_uncertainty(trainer.datamodule)  # pyright: ignore[reportAttributeAccessIssue]
-            save_world_model(folder, pl_module.model)
+            save_world_model(folder, pl_module.kept)
         elif isinstance(pl_module, CQL):
             save_policy(folder, pl_module.average_actor)
         Console().print(f"Published the weights of the last update: {folder}", highlight=False, soft_wrap=True)
@@ -146,10 +147,11 @@ class _LinkedCLI(LightningCLI):
     def before_instantiate_classes(self) -> None:
         config = self.config[str(self.subcommand)]
         options, trainer = config.model.options, config.trainer
+        budget = _unwrapped(options).get("ensemble") or options
         if trainer.max_epochs is None and trainer.max_steps == -1:
-            trainer.max_epochs = max(1, options.updates // options.updates_per_epoch)
+            trainer.max_epochs = max(1, budget.updates // budget.updates_per_epoch)
         if trainer.gradient_clip_val is None:  # refused under the agents' manual optimisation, and they have none
-            trainer.gradient_clip_val = getattr(options, "gradient_clip", None)
+            trainer.gradient_clip_val = budget.get("gradient_clip")
 
 
 class ModelCLI(_LinkedCLI):
@@ -157,13 +159,11 @@ class ModelCLI(_LinkedCLI):
 
     options = TrainModelOptions
     verbs = ("fit", "validate", "test")
-    links = {
-        "model.options.model.context": "data.context",
-        "model.options.batch_size": "data.batch_size",
-        "model.options.updates_per_epoch": "data.updates_per_epoch",
-        "model.options.held_out": "data.held_out",
-        "model.seed": "data.seed",
-    }
+    links = {"model.options.held_out": "data.held_out", "model.seed": "data.seed"}
+
+    def link_more(self, parser: LightningArgumentParser) -> None:
+        for name in ("context", "batch_size", "updates_per_epoch", "members"):
+            parser.link_arguments("model.options", f"data.{name}", compute_fn=_window_option(name))
 
 
 class AgentCLI(_LinkedCLI):
@@ -184,6 +184,16 @@ class AgentCLI(_LinkedCLI):
     def link_more(self, parser: LightningArgumentParser) -> None:
         updates = ("model.options.updates_per_epoch", "model.options.updates_per_step")
         parser.link_arguments(updates, "data.steps_per_epoch", compute_fn=lambda epoch, step: max(1, epoch // step))
+
+
+def _window_option(name: str) -> Callable[[Namespace], Any]:
+    return lambda options: window_options(_unwrapped(options))[name]
+
+
+def _unwrapped(options: Namespace) -> Any:
+    """The ensemble's options as plain attributes: while jsonargparse links, it wraps an optional dataclass."""
+    ensemble = options.get("ensemble") or Namespace()
+    return Namespace({**vars(options), "ensemble": ensemble.get("init_args", ensemble) or None})
 
 
 def _saved_options(checkpoint: str, kind: type[TrainModelOptions] | type[PolicyOptions]) -> dict[str, Any]:

@@ -54,11 +54,40 @@ class ModelOptions:
 
 
 @dataclass(frozen=True)
+class EnsembleOptions:
+    """The ensemble of Gaussian networks of MBPO, MOPO, COMBO and RAMBO, and how it is trained.
+
+    Attributes:
+        members: networks, each trained on a bootstrap resample of its own.
+        elites: members of least held-out error, the ones that predict.
+        hidden: units of each hidden layer.
+        updates: gradient steps at most.
+        updates_per_epoch: gradient steps between two validations (and resumable checkpoints).
+        batch_size: rows per gradient step and member.
+        learning_rate: Adam's.
+        weight_decay: of each layer, the output layer last: half this times the squared weights is added to the loss.
+        patience: epochs without a member whose held-out error falls by 1 %, after which training stops.
+    """
+
+    members: int = 7
+    elites: int = 5
+    hidden: tuple[int, ...] = (200, 200, 200, 200)
+    updates: int = 100_000
+    updates_per_epoch: int = 500
+    batch_size: int = 256
+    learning_rate: float = 0.001
+    weight_decay: tuple[float, ...] = (0.000025, 0.00005, 0.000075, 0.000075, 0.0001)
+    patience: int = 5
+
+
+@dataclass(frozen=True)
 class TrainModelOptions:
     """How the world model is trained.
 
     Attributes:
         model: architecture and objective.
+        ensemble: a section trains the ensemble in place of the transformer, and of this section only `held_out` is
+            read beside it; null trains the transformer.
         updates: gradient steps in all.
         updates_per_epoch: gradient steps between two validations (and resumable checkpoints).
         batch_size: windows of `model.context` steps per gradient step.
@@ -71,6 +100,7 @@ class TrainModelOptions:
     """
 
     model: ModelOptions = field(default_factory=ModelOptions)
+    ensemble: EnsembleOptions | None = None
     updates: int = 6_000
     updates_per_epoch: int = 1_000
     batch_size: int = 32

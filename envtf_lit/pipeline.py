@@ -47,45 +47,56 @@ def download(params: Params, root: Path = Path("."), *, progress: bool = True) -
 
 def train_model(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
     """Trains the world model and keeps the weights of least held-out open-loop error: `models/world_model/`."""
-    from envtf_lit.data.loaders import WindowData
+    with _stage("train_model", params, root):
+        return fit_world_model(params, root / DATASET, root / WORLD_MODEL, root=root, progress=progress)
+
+
+def fit_world_model(
+    params: Params, dataset: Path, target: Path, *, root: Path = Path("."), progress: bool = True
+) -> dict[str, Any]:
+    """Trains the world model that `params.train_model` describes on a dataset file and writes its folder.
+
+    Args:
+        params: train_model, seed and precision count; threads and global seeds are the caller's.
+        dataset: HDF5 or NPZ.
+        target: folder of the weights, metrics, curves and resolved options.
+        root: below it lies what a killed run continues from.
+        progress: shows a bar.
+
+    Returns:
+        Parameters, epoch of the kept weights, and their held-out errors.
+    """
     from envtf_lit.training import fit, run_folder
-    from envtf_lit.world_models.lit import LitWorldModel
+    from envtf_lit.world_models.lit import lit_world_model, window_data
     from envtf_lit.world_models.store import save_world_model
 
     options = params.train_model
-    with _stage("train_model", params, root):
-        data = WindowData(
-            str(root / DATASET),
-            context=options.model.context,
-            batch_size=options.batch_size,
-            updates_per_epoch=options.updates_per_epoch,
-            held_out=options.held_out,
-            seed=params.seed,
-        )
-        lit = LitWorldModel(data.observation_dim, data.action_dim, options, seed=params.seed)
-        key = _key(params, asdict(options))
-        curves = fit(
-            lit,
-            data,
-            run=run_folder(root, "train_model", key, [root / DATASET]),
-            epochs=options.updates // options.updates_per_epoch,
-            precision=params.precision,
-            progress=progress,
-            monitor="val/open_loop_error",
-            gradient_clip=options.gradient_clip,
-        )
-        lit.fit_uncertainty(data)
-        best = min(curves.rows, key=lambda row: row["val/open_loop_error"])
-        metrics = {
-            "parameters": sum(p.numel() for p in lit.model.parameters()),
-            "epoch": int(best["epoch"]),
-            "open_loop_error": best["val/open_loop_error"],
-            "val_loss": best["val/loss"],
-        }
-        with replacing(root / WORLD_MODEL) as folder:
-            save_world_model(folder, lit.model)
-            _record(folder, metrics, key)
-            curves.write(folder / "curves.csv")
+    budget = options.ensemble or options
+    data = window_data(str(dataset), options, seed=params.seed)
+    lit = lit_world_model(data.observation_dim, data.action_dim, options, seed=params.seed)
+    key = _key(params, asdict(options))
+    curves = fit(
+        lit,
+        data,
+        run=run_folder(root, "train_model", key, [dataset]),
+        epochs=budget.updates // budget.updates_per_epoch,
+        precision=params.precision,
+        progress=progress,
+        monitor=lit.monitor,
+        gradient_clip=lit.gradient_clip,
+    )
+    lit.fit_uncertainty(data)
+    best = curves.rows[-1] if (name := lit.monitor) is None else min(curves.rows, key=lambda row: row[name])
+    metrics = {
+        "parameters": sum(p.numel() for p in lit.kept.parameters()),
+        "epoch": int(best["epoch"]),
+        "open_loop_error": best["val/open_loop_error"],
+        "val_loss": best["val/loss"],
+    }
+    with replacing(target) as folder:
+        save_world_model(folder, lit.kept)
+        _record(folder, metrics, key)
+        curves.write(folder / "curves.csv")
     return metrics
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.params import DownloadOptions, ModelOptions, Params, PolicyOptions, TrainModelOptions
+from envtf_lit.params import DownloadOptions, EnsembleOptions, ModelOptions, Params, PolicyOptions, TrainModelOptions
 
 
 class Range(NamedTuple):
@@ -31,7 +31,7 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("threads", "layers", "heads", "width", "context", "updates", "updates_per_epoch"), _COUNT),
     **dict.fromkeys(("updates_per_step", "batch_size", "clone_updates", "clone_batch_size", "branches"), _COUNT),
     **dict.fromkeys(("horizon", "buffer_size", "hidden", "critics", "sampled_actions", "episodes"), _COUNT),
-    **dict.fromkeys(("trajectories", "n_step", "selection_steps"), _COUNT),
+    **dict.fromkeys(("trajectories", "n_step", "selection_steps", "members", "elites", "patience"), _COUNT),
     **dict.fromkeys(
         ("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty", "tail", "posterior"),
         _NOT_NEGATIVE,
@@ -133,8 +133,7 @@ def check_rules(params: Params) -> None:
     if params.task is not None:
         get_task(params.task)
     check_download(params.download, named=params.task is not None)
-    _check_model(params.train_model.model)
-    _check_epochs("train_model", params.train_model)
+    check_world_model(params.train_model)
     _check_policies(params)
     _check_epistemic(params)
     _check_history("generate_rollouts", params.generate_rollouts.history, params.train_model.model)
@@ -165,6 +164,19 @@ def check_download(options: DownloadOptions, *, named: bool) -> None:
             )
 
 
+def check_world_model(options: TrainModelOptions) -> None:
+    """The rules that tie the world model's options together.
+
+    Raises:
+        UserError: one is broken.
+    """
+    _check_model(options.model)
+    _check_epochs("train_model", options)
+    if options.ensemble is not None:
+        _check_epochs("train_model.ensemble", options.ensemble)
+        _check_ensemble(options.ensemble)
+
+
 def _check_model(model: ModelOptions) -> None:
     if model.width % (2 * model.heads):
         raise UserError(
@@ -176,6 +188,19 @@ def _check_model(model: ModelOptions) -> None:
         raise UserError(
             f"train_model.model.objective is paper_mse and epistemic is {model.epistemic}: that objective trains the "
             "paper's third head, so set epistemic to head."
+        )
+
+
+def _check_ensemble(options: EnsembleOptions) -> None:
+    if options.elites > options.members:
+        raise UserError(
+            f"train_model.ensemble.elites is {options.elites} and members is {options.members}: elites are chosen from "
+            "the members, so take no more than those."
+        )
+    if len(options.weight_decay) != len(options.hidden) + 1:
+        raise UserError(
+            f"train_model.ensemble.weight_decay has {len(options.weight_decay)} entries and there are "
+            f"{len(options.hidden) + 1} layers, the output layer among them: give one for each."
         )
 
 
@@ -219,7 +244,7 @@ def _check_epistemic(params: Params) -> None:
             )
 
 
-def _check_epochs(section: str, options: TrainModelOptions | PolicyOptions) -> None:
+def _check_epochs(section: str, options: TrainModelOptions | EnsembleOptions | PolicyOptions) -> None:
     if options.updates % options.updates_per_epoch:
         raise UserError(
             f"{section}.updates is {options.updates}: take a multiple of its updates_per_epoch "

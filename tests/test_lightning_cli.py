@@ -16,6 +16,7 @@ from envtf_lit.cli import main
 from envtf_lit.data.formats import save_dataset
 from envtf_lit.data.loaders import TransitionData, Transitions
 from envtf_lit.params import Params, PolicyOptions
+from envtf_lit.world_models.ensemble import EnsembleDynamics
 from tests.walker import walker_dataset
 
 SIZES = {
@@ -115,6 +116,16 @@ def test_agent_fit_publishes_a_policy_with_the_datas_scale_and_limits(
     saved = torch.load(checkpoint, weights_only=True)
     assert saved["hyper_parameters"]["action_low"] == [-2.0] * 3
     assert all(torch.equal(saved["state_dict"][f"average_actor.{k}"], v) for k, v in policy.state_dict().items())
+
+
+def test_model_fit_trains_the_ensemble_where_its_options_stand(folder: Path) -> None:
+    sizes = {"members": 3, "elites": 2, "hidden": [8], "weight_decay": [0, 0], "updates": 4, "updates_per_epoch": 2}
+    fit("model", ensemble=json.dumps(sizes))
+    model = load_world_model(".envtf/published")
+    assert isinstance(model, EnsembleDynamics) and model.members == 3 and len(model.elite) == 2
+    (checkpoint,) = Path(".envtf").rglob("*.ckpt")
+    envtf("model", "validate", NO_LOGGER, f"--ckpt_path={checkpoint}")
+    fit("model", NO_LOGGER, f"--model.init_from={Path('.envtf/published').absolute()}", ensemble=json.dumps(sizes))
 
 
 def test_model_fit_publishes_and_starts_from_published_weights(folder: Path) -> None:

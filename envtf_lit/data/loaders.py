@@ -130,9 +130,9 @@ def _place(column: Column, device: torch.device, resident: bool) -> Tensor | Fil
 class Windows(Dataset[dict[str, Tensor]]):
     """Windows of up to T consecutive steps that never cross an episode.
 
-    Indexed by a tensor of B window numbers. An episode of L steps has L + T - 1 windows, those that overlap it by at
-    least one step, so that each row is seen equally often: the first token of a rollout must be learned too. What
-    sticks out on either side is cut, and the rest is moved to the left and padded on the right.
+    Indexed by a tensor of window numbers of any shape. An episode of L steps has L + T - 1 windows, those that overlap
+    it by at least one step, so that each row is seen equally often: the first token of a rollout must be learned too.
+    What sticks out on either side is cut, and the rest is moved to the left and padded on the right.
     """
 
     def __init__(self, dataset: OfflineDataset, length: int, device: torch.device | str = "cpu") -> None:
@@ -151,9 +151,9 @@ class Windows(Dataset[dict[str, Tensor]]):
         begin = self.ends[episode] - (self.offsets[episode] - windows)  # may lie before the episode
         start = torch.maximum(begin, self.starts[episode])
         end = torch.minimum(begin + self.length, self.ends[episode])
-        index = start[:, None] + torch.arange(self.length, device=start.device)  # (B, T)
-        mask = index < end[:, None]
-        index = torch.minimum(index, end[:, None] - 1)
+        index = start[..., None] + torch.arange(self.length, device=start.device)  # (..., T)
+        mask = index < end[..., None]
+        index = torch.minimum(index, end[..., None] - 1)
         return self.store[index] | {"mask": mask.float()}
 
     def tiles(self) -> Tensor:
@@ -163,6 +163,24 @@ class Windows(Dataset[dict[str, Tensor]]):
         episode = torch.repeat_interleave(torch.arange(len(lengths)), count)
         position = torch.arange(len(episode)) - torch.repeat_interleave(count.cumsum(0) - count, count)
         return (offsets - lengths)[episode] + position * self.length
+
+
+class Resamples(Dataset[dict[str, Tensor]]):
+    """Bootstrap resamples of windows: as many draws with replacement as there are windows, for each of M members.
+
+    Indexed by (M, B) positions, row m within the resample of member m.
+    """
+
+    def __init__(self, windows: Windows, members: int, *, seed: int) -> None:
+        self.windows = windows
+        generator = epoch_generator(seed, 0, "bootstrap")
+        self.drawn = torch.randint(len(windows), (members, len(windows)), generator=generator)  # (M, N)
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __getitem__(self, positions: Tensor) -> dict[str, Tensor]:
+        return self.windows[torch.take_along_dim(self.drawn, positions, 1)]
 
 
 class Transitions(Dataset[dict[str, Tensor]]):
@@ -220,6 +238,8 @@ class WindowData(L.LightningDataModule):
         updates_per_epoch: batches per epoch.
         held_out: share of the episodes kept for validation.
         seed: of the split and of all draws.
+        members: of an ensemble, each of which has its own bootstrap resample of the training windows; its batches come
+            first in the shape, (members, batch_size, context, …). None gives plain windows.
     """
 
     train: OfflineDataset
@@ -233,9 +253,10 @@ class WindowData(L.LightningDataModule):
         updates_per_epoch: int = 1_000,
         held_out: float = 0.1,
         seed: int = 0,
+        members: int | None = None,
     ) -> None:
         super().__init__()
-        self.path, self.context, self.batch_size = path, context, batch_size
+        self.path, self.context, self.batch_size, self.members = path, context, batch_size, members
         self.updates_per_epoch, self.share, self.seed = updates_per_epoch, held_out, seed
         self.dataset = load_dataset(path)
         self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
@@ -245,10 +266,11 @@ class WindowData(L.LightningDataModule):
         self.train, self.held_out = self.dataset.split(self.share, seed=self.seed)
 
     def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """Batches (B, T, …) of `Windows`."""
+        """Batches (B, T, …) of `Windows`, or (M, B, T, …) of `Resamples`."""
         windows = Windows(self.train, self.context, _device(self))
-        sampler = DrawSampler(len(windows), (self.batch_size,), self.updates_per_epoch, seed=self.seed)
-        return _loader(windows, sampler)
+        shape = (self.batch_size,) if self.members is None else (self.members, self.batch_size)
+        sampler = DrawSampler(len(windows), shape, self.updates_per_epoch, seed=self.seed)
+        return _loader(windows if self.members is None else Resamples(windows, self.members, seed=self.seed), sampler)
 
     def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:
         """Each held-out row once."""

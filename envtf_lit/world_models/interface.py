@@ -22,7 +22,8 @@ class Prediction:
         uncertainty: (B,) `||sqrt(S_au + S_eu)||_2 / sqrt(S)` over z-scored live observation dimensions: the penalty u.
         novelty: (B,) epistemic variance as a multiple of its 0.999 quantile over the training data: beyond 1 the model
             has left what it knows. None where the model has no such estimate.
-        log_prob: (B,) log-density of (observation, reward) under the predictive distribution.
+        log_prob: (B,) log-density of (observation, reward) under the predictive distribution; gradients reach the
+            distribution alone, not the draw.
     """
 
     observation: Tensor

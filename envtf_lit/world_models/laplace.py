@@ -86,7 +86,7 @@ class LastLayerLaplace(nn.Module):
         self.root.copy_(root)
         self.residual.copy_(residual)
         self.scale.copy_(SCALES[surprise.argmin()])
-        self.limit.copy_(_quantile((tokens @ root.T).square().sum(-1), OUTSIDE))
+        self.limit.copy_(quantile((tokens @ root.T).square().sum(-1), OUTSIDE))
 
 
 def clusters(points: Tensor, generator: torch.Generator, count: int = CLUSTERS) -> Tensor:
@@ -119,7 +119,7 @@ def _surprise(squared: Tensor, aleatoric: Tensor, spread: Tensor) -> Tensor:
     return torch.stack([0.5 * (squared / variance + variance.log()).sum() for variance in variances]).to(SCALES.device)
 
 
-def _quantile(values: Tensor, share: float) -> Tensor:
+def quantile(values: Tensor, share: float) -> Tensor:
     """Of any number of values; `torch.quantile` takes 16 million."""
     rank = max(1, round(share * len(values)))
     return values.kthvalue(rank).values

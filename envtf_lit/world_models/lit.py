@@ -1,5 +1,6 @@
-"""The LightningModule of the world model: wires objective, optimiser and validation, nothing else."""
+"""The LightningModules of the world models: they wire objective, optimiser and validation, nothing else."""
 
+import copy
 import math
 from dataclasses import asdict
 from typing import Any
@@ -9,19 +10,53 @@ import torch
 from torch import Tensor
 
 from envtf_lit.data.loaders import WindowData, epoch_generator
-from envtf_lit.params import ModelOptions, TrainModelOptions
+from envtf_lit.params import EnsembleOptions, ModelOptions, TrainModelOptions
 from envtf_lit.storage import load_weights
+from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.horizon import Scale, open_loop_error, segments, whole_episodes
 from envtf_lit.world_models.recalibration import calibration_split
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 SELECTION_SEGMENTS, SELECTION_HORIZON = 256, 20  # open-loop stretches by which models are selected
-EPISTEMIC_TOKENS = 100_000  # training rows that the last layer's posterior is fitted to, at most
+EPISTEMIC_TOKENS = 100_000  # training rows that epistemic variance is fitted to, at most
 CALIBRATION_EPISODES = 50  # held-out episodes that the predicted variances are scaled by, at most
+IMPROVEMENT = 0.01  # of a member's held-out error, below which it counts as none
+
+
+def lit_world_model(
+    observation_dim: int,
+    action_dim: int,
+    options: TrainModelOptions | None = None,
+    seed: int = 0,
+    init_from: str | None = None,
+) -> "LitWorldModel":
+    """The module that trains what the options name: the ensemble if they have a section for it, or the transformer."""
+    options = options or TrainModelOptions()
+    kind = LitWorldModel if options.ensemble is None else LitEnsemble
+    return kind(observation_dim, action_dim, options, seed, init_from)
+
+
+def window_data(path: str, options: TrainModelOptions, *, seed: int) -> WindowData:
+    """The data that such options are trained on."""
+    return WindowData(path, **window_options(options), held_out=options.held_out, seed=seed)
+
+
+def window_options(options: TrainModelOptions) -> dict[str, Any]:
+    """What the options ask of `WindowData`; an ensemble wants windows of one step, as many batches as members."""
+    ensemble, budget = options.ensemble, options.ensemble or options
+    return dict(
+        context=options.model.context if ensemble is None else 1,
+        batch_size=budget.batch_size,
+        updates_per_epoch=budget.updates_per_epoch,
+        members=None if ensemble is None else ensemble.members,
+    )
 
 
 class LitWorldModel(L.LightningModule):
     """Trains an Environment Transformer on windows of a log.
+
+    Attributes:
+        monitor: logged name by which the kept weights are selected, or None where the module selects them itself.
 
     Args:
         observation_dim: S.
@@ -30,6 +65,8 @@ class LitWorldModel(L.LightningModule):
         seed: of dropout and of sampled objectives.
         init_from: a published model folder whose weights to start from.
     """
+
+    monitor: str | None = "val/open_loop_error"
 
     def __init__(
         self,
@@ -45,7 +82,20 @@ class LitWorldModel(L.LightningModule):
             dict(observation_dim=observation_dim, action_dim=action_dim, options=asdict(self.options), seed=seed)
         )
         self.seed, self.init_from = seed, init_from
-        self.model = EnvironmentTransformer(observation_dim, action_dim, **asdict(self.options.model))
+        self.model: Any = self._build(observation_dim, action_dim)
+
+    def _build(self, observation_dim: int, action_dim: int) -> EnvironmentTransformer | EnsembleDynamics:
+        return EnvironmentTransformer(observation_dim, action_dim, **asdict(self.options.model))
+
+    @property
+    def kept(self) -> Any:
+        """The world model to keep: the one that validation scores."""
+        return self.model
+
+    @property
+    def gradient_clip(self) -> float | None:
+        """Largest gradient norm."""
+        return self.options.gradient_clip
 
     def setup(self, stage: str) -> None:
         """Takes the normaliser from the training episodes and fixes the stretches that select the model."""
@@ -62,11 +112,14 @@ class LitWorldModel(L.LightningModule):
 
         Once, at the end, with `data` set up.
         """
-        batches = data.training_tiles(EPISTEMIC_TOKENS)
-        self.model.eval().fit_epistemic(batches, generator=epoch_generator(self.seed, 0, "clusters"))
+        self._fit_epistemic(data)
         calibration, _ = calibration_split(data.held_out)
         if calibration is not None:
             self.model.recalibrate(whole_episodes(calibration, CALIBRATION_EPISODES, seed=self.seed))
+
+    def _fit_epistemic(self, data: WindowData) -> None:
+        batches = data.training_tiles(EPISTEMIC_TOKENS)
+        self.kept.eval().fit_epistemic(batches, generator=epoch_generator(self.seed, 0, "clusters"))
 
     def on_train_epoch_start(self) -> None:
         # one stream per epoch, for dropout as for sampling: a resumed run draws what an uninterrupted one would have
@@ -81,14 +134,14 @@ class LitWorldModel(L.LightningModule):
         self.log("val/loss", self.model.loss(batch), batch_size=int(batch["mask"].sum()))
 
     def on_validation_epoch_end(self) -> None:
-        error = open_loop_error(self.model, self.segments, self.scale)
+        error = open_loop_error(self.kept, self.segments, self.scale)
         self.log("val/open_loop_error", error, prog_bar=True)
 
     def test_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
-        self.log("test/loss", self.model.loss(batch), batch_size=int(batch["mask"].sum()))
+        self.log("test/loss", self.kept.loss(batch), batch_size=int(batch["mask"].sum()))
 
     def on_test_epoch_end(self) -> None:
-        self.log("test/open_loop_error", open_loop_error(self.model, self.segments, self.scale))
+        self.log("test/open_loop_error", open_loop_error(self.kept, self.segments, self.scale))
 
     def configure_optimizers(self) -> dict[str, Any]:
         o = self.options
@@ -109,10 +162,102 @@ class LitWorldModel(L.LightningModule):
         return min(1.0, (update + 1) / warmup) * 0.5 * (1.0 + math.cos(math.pi * progress))
 
 
+class LitEnsemble(LitWorldModel):
+    """Trains an ensemble on bootstrap resamples until no member's held-out error falls any more (MBPO's recipe).
+
+    Each member is kept as it was when its own error was least. Arguments as of `LitWorldModel`.
+    """
+
+    monitor = None
+    best_error: Tensor
+    stale: Tensor
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        options: TrainModelOptions | dict[str, Any] | None = None,
+        seed: int = 0,
+        init_from: str | None = None,
+    ) -> None:
+        super().__init__(observation_dim, action_dim, options, seed, init_from)
+        self.best = copy.deepcopy(self.model).requires_grad_(False)  # a module, so that checkpoints hold it
+        self.register_buffer("best_error", torch.full((self.ensemble.members,), torch.inf))
+        self.register_buffer("stale", torch.zeros((), dtype=torch.int64))  # epochs since a member improved
+
+    @property
+    def ensemble(self) -> EnsembleOptions:
+        """The options that count here."""
+        assert self.options.ensemble is not None
+        return self.options.ensemble
+
+    def _build(self, observation_dim: int, action_dim: int) -> EnsembleDynamics:
+        o = self.ensemble
+        return EnsembleDynamics(observation_dim, action_dim, members=o.members, elites=o.elites, hidden=o.hidden)
+
+    @property
+    def kept(self) -> EnsembleDynamics:
+        """The members at their best."""
+        return self.best
+
+    @property
+    def gradient_clip(self) -> None:
+        """The recipe has none."""
+
+    def setup(self, stage: str) -> None:
+        """As for the transformer; the kept members begin as the trained ones."""
+        super().setup(stage)
+        self.best.load_state_dict(self.model.state_dict())
+
+    def fit_uncertainty(self, data: WindowData) -> None:
+        """Fits the limit of novelty to training windows; the variances stay what the recipe makes them."""
+        self._fit_epistemic(data)
+
+    def on_fit_start(self) -> None:
+        self._stop_when_stale()  # a run may have been killed just after it stopped
+
+    def _stop_when_stale(self) -> None:
+        if int(self.stale) >= self.ensemble.patience:
+            self.trainer.should_stop = True
+
+    def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
+        loss = self.model.loss(batch)
+        self.log("train/loss", loss / self.ensemble.members, on_step=False, on_epoch=True, batch_size=1)
+        return loss + self.model.decay(self.ensemble.weight_decay)
+
+    def on_validation_epoch_start(self) -> None:
+        self.squared, self.entries = torch.zeros_like(self.best_error), torch.zeros_like(self.best_error[0])
+
+    def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
+        model = self.model if self.trainer.state.fn == "fit" else self.best
+        squared, entries = model.squared_error(batch)
+        self.squared, self.entries = self.squared + squared, self.entries + entries
+
+    def on_validation_epoch_end(self) -> None:
+        error = self.squared / self.entries
+        self.log("val/loss", error.mean())
+        if self.trainer.state.fn == "fit":
+            self._keep_the_best(error)
+            self._stop_when_stale()
+        super().on_validation_epoch_end()
+
+    def _keep_the_best(self, error: Tensor) -> None:
+        """Takes over the members that improved, given the held-out errors of all (M,)."""
+        improved = error < (1.0 - IMPROVEMENT) * self.best_error
+        self.best.adopt(self.model, improved)
+        self.best_error = torch.where(improved, error, self.best_error)
+        self.best.elite.copy_(self.best_error.argsort()[: self.ensemble.elites])
+        self.stale = torch.where(improved.any(), 0, self.stale + 1)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.Adam(self.model.parameters(), lr=self.ensemble.learning_rate)
+
+
 def _train_options(options: TrainModelOptions | dict[str, Any] | None) -> TrainModelOptions:
     """Options as given, or rebuilt from the plain dictionary of a checkpoint."""
     if options is None:
         return TrainModelOptions()
     if isinstance(options, TrainModelOptions):
         return options
-    return TrainModelOptions(**{**options, "model": ModelOptions(**options["model"])})
+    ensemble = None if options["ensemble"] is None else EnsembleOptions(**options["ensemble"])
+    return TrainModelOptions(**{**options, "model": ModelOptions(**options["model"]), "ensemble": ensemble})

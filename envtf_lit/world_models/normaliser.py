@@ -75,3 +75,13 @@ class Normaliser(nn.Module):
         if self.delta:
             outcome = outcome + nn.functional.pad(observation, (0, 1))
         return outcome
+
+    def uncertainty(self, variance: Tensor) -> Tensor:
+        """Variances (..., S + 1) of unit-scale targets to `||sqrt(variance)||_2 / sqrt(S)`, (...).
+
+        Over live observation dimensions, z-scored by the data's own spread: `Prediction.uncertainty`.
+        """
+        ratio = self.target_std[:-1] / self.observation_std
+        live = self.live.float()
+        scaled = variance[..., :-1] * ratio.square() * live
+        return (scaled.sum(-1) / live.sum().clamp(min=1)).sqrt()

@@ -6,14 +6,19 @@ from typing import Any
 from torch import nn
 
 from envtf_lit.storage import load_module, save_module
+from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
-WORLD_MODELS: dict[str, type[nn.Module]] = {"environment_transformer": EnvironmentTransformer}
+WORLD_MODELS: dict[str, type[nn.Module]] = {
+    "environment_transformer": EnvironmentTransformer,
+    "ensemble_dynamics": EnsembleDynamics,
+}
 
 
-def save_world_model(folder: str | Path, model: EnvironmentTransformer) -> None:
+def save_world_model(folder: str | Path, model: EnvironmentTransformer | EnsembleDynamics) -> None:
     """Writes `weights.safetensors` and `config.json`."""
-    save_module(folder, model, kind="environment_transformer", arguments=model.arguments)
+    kind = next(name for name, cls in WORLD_MODELS.items() if isinstance(model, cls))
+    save_module(folder, model, kind=kind, arguments=model.arguments)
 
 
 def load_world_model(folder: str | Path) -> Any:

@@ -368,17 +368,10 @@ class EnvironmentTransformer(nn.Module):
             mean=self.normaliser.outcome(observation, mean),
             aleatoric=aleatoric.sqrt() * scale,
             epistemic=None if epistemic is None else epistemic.sqrt() * scale,
-            uncertainty=self._uncertainty(variance),
+            uncertainty=self.normaliser.uncertainty(variance),
             novelty=novelty,
-            log_prob=-nll(mean, variance.log(), value) - scale.log().sum(),
+            log_prob=-nll(mean, variance.log(), value.detach()) - scale.log().sum(),
         )
-
-    def _uncertainty(self, variance: Tensor) -> Tensor:
-        """`||sqrt(S_au + S_eu)||_2 / sqrt(S)` over live observation dimensions, z-scored by the data's own spread."""
-        ratio = self.normaliser.target_std[:-1] / self.normaliser.observation_std
-        live = self.normaliser.live.float()
-        scaled = variance[..., :-1] * ratio.square() * live
-        return (scaled.sum(-1) / live.sum().clamp(min=1)).sqrt()
 
     def observe(self, state: TransformerState, observation: Tensor) -> TransformerState:
         """See `WorldModel.observe`."""
