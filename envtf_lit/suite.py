@@ -1,0 +1,143 @@
+"""The world models that are compared throughout, trained alike on one of the zoo's datasets.
+
+The transformer, the same transformer with a context of one step, and the ensemble: what is measured of world models is
+measured of these three, and models that lie there already, trained with the same settings, are not trained again.
+"""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+
+from envtf_lit import pipeline
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.formats import load_dataset
+from envtf_lit.errors import UserError, did_you_mean
+from envtf_lit.params import DownloadOptions, EnsembleOptions, Params, Precision, TrainModelOptions
+from envtf_lit.storage import read_json, write_json
+from envtf_lit.tasks import Robot, get_task
+from envtf_lit.validation import check_world_model
+
+MODELS = ("transformer", "context_1", "ensemble")  # their names in every table, figure and file
+WORK = Path(".envtf/suite")  # where suites are kept unless told otherwise
+
+
+@dataclass(frozen=True)
+class SuiteOptions:
+    """What the models of a suite share, and their budgets.
+
+    Attributes:
+        transitions: rows of the zoo's dataset.
+        updates: gradient steps of the transformer and of its ablation, which sees as many steps per update.
+        ensemble: the ensemble and its budget; it stops early.
+        seed: of data and training.
+        threads: CPU threads.
+        precision: of matrix products in training.
+    """
+
+    transitions: int = 100_000
+    updates: int = 6_000
+    ensemble: EnsembleOptions = field(default_factory=EnsembleOptions)
+    seed: int = 0
+    threads: int = 2
+    precision: Precision = "bf16"
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Trained models on disk; `load_world_model(suite.folders[name])` gives one.
+
+    Attributes:
+        task: robot and tier.
+        robot: its robot.
+        options: what it was made with.
+        dataset: the file that all models were trained on.
+        folders: by the model's name.
+        seconds: of training, by the model's name, as measured when it was trained.
+    """
+
+    task: str
+    robot: Robot
+    options: SuiteOptions
+    dataset: Path
+    folders: dict[str, Path]
+    seconds: dict[str, float]
+
+    def split(self) -> tuple[OfflineDataset, OfflineDataset]:
+        """The episodes that every model was trained on, and those that none was."""
+        return load_dataset(self.dataset).split(TrainModelOptions().held_out, seed=self.options.seed)
+
+
+def build_suite(
+    task: str, root: Path, options: SuiteOptions, *, models: Sequence[str] = MODELS, progress: bool = True
+) -> Suite:
+    """Collects the task's dataset and trains the models, all below `root / task`; what is there is kept.
+
+    Args:
+        task: robot and tier, such as `hopper-medium`.
+        root: folder of suites.
+        options: of the data and the models.
+        models: which of `MODELS`.
+        progress: shows bars.
+
+    Raises:
+        UserError: an unknown task or model, or options that contradict each other.
+    """
+    for name in models:
+        if name not in MODELS:
+            raise UserError(f"Unknown model {name!r}: {did_you_mean(name, MODELS)}")
+    home, params = root / task, {name: _params(name, task, options) for name in models}
+    origin = {"task": task, "transitions": options.transitions, "seed": options.seed}
+    shared = replace(Params(), task=task, **_common(options))
+    _unless_done(home / "data.json", origin, lambda: pipeline.download(shared, home, progress=progress))
+    dataset, folders, seconds = home / pipeline.DATASET, {}, {}
+    for name in models:
+        folders[name] = home / "models" / name
+        key = origin | {"threads": options.threads, "precision": options.precision}
+        key["train_model"] = json.loads(json.dumps(asdict(params[name].train_model)))  # tuples become lists
+        train = partial(_train, params[name], dataset, folders[name], home, progress)
+        seconds[name] = _unless_done(home / "models" / f"{name}.json", key, train)
+    return Suite(task, get_task(task).robot, options, dataset, folders, seconds)
+
+
+def _common(options: SuiteOptions) -> dict[str, Any]:
+    """What the stages' parameters take over from the suite's."""
+    download = DownloadOptions(transitions=options.transitions)
+    return dict(seed=options.seed, threads=options.threads, precision=options.precision, download=download)
+
+
+def _params(name: str, task: str, options: SuiteOptions) -> Params:
+    """The parameters that train one of `MODELS`."""
+    train = TrainModelOptions(updates=options.updates, updates_per_epoch=min(1_000, options.updates))
+    if name == "context_1":  # windows of one step, as many steps per update
+        model = replace(train.model, context=1)
+        train = replace(train, model=model, batch_size=train.batch_size * train.model.context)
+    elif name == "ensemble":
+        train = replace(train, ensemble=options.ensemble)
+    params = replace(Params(), task=task, train_model=train, **_common(options))
+    check_world_model(train)
+    return params
+
+
+def _unless_done(record: Path, settings: dict[str, Any], work: Callable[[], object]) -> float:
+    """Seconds that the work took, now or when it was done with the same settings."""
+    if record.exists() and (done := read_json(record)).get("settings") == settings:
+        return done["seconds"]
+    record.unlink(missing_ok=True)  # what lies there is about to be replaced
+    begin = time.perf_counter()
+    work()
+    seconds = time.perf_counter() - begin
+    write_json(record, {"settings": settings, "seconds": round(seconds, 1)})
+    return round(seconds, 1)
+
+
+def _train(params: Params, dataset: Path, folder: Path, home: Path, progress: bool) -> None:
+    torch.set_num_threads(params.threads)
+    L.seed_everything(params.seed, verbose=False)
+    pipeline.fit_world_model(params, dataset, folder, root=home, progress=progress)

@@ -1,0 +1,47 @@
+"""The models that are compared: trained once with the same settings, and anew with others."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from envtf_lit import load_world_model
+from envtf_lit.errors import UserError
+from envtf_lit.params import EnsembleOptions
+from envtf_lit.suite import MODELS, SuiteOptions, build_suite
+from envtf_lit.world_models.ensemble import EnsembleDynamics
+from envtf_lit.world_models.transformer import EnvironmentTransformer
+
+ENSEMBLE = EnsembleOptions(
+    members=3, elites=2, hidden=(8,), weight_decay=(0.0, 0.0), updates=4, updates_per_epoch=2, batch_size=8
+)
+TINY = SuiteOptions(transitions=1_000, updates=2, ensemble=ENSEMBLE, threads=1)
+
+
+@pytest.mark.filterwarnings("ignore:.*treespec, LeafSpec:FutureWarning")
+def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(tmp_path: Path) -> None:
+    suite = build_suite("hopper-medium", tmp_path, TINY, progress=False)
+    assert tuple(suite.folders) == MODELS == tuple(suite.seconds)
+    transformer, context_1, ensemble = (load_world_model(folder) for folder in suite.folders.values())
+    assert isinstance(transformer, EnvironmentTransformer) and transformer.options.context > 1
+    assert isinstance(context_1, EnvironmentTransformer) and context_1.options.context == 1
+    assert isinstance(ensemble, EnsembleDynamics) and ensemble.members == 3
+    training, held_out = suite.split()
+    assert len(training) + len(held_out) == 1_000
+
+    written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
+    assert build_suite("hopper-medium", tmp_path, TINY, progress=False) == suite
+    changed = replace(TINY, ensemble=replace(ENSEMBLE, hidden=(9,)))
+    build_suite("hopper-medium", tmp_path, changed, progress=False)
+    anew = {path for path, time in written.items() if path.stat().st_mtime_ns != time}
+    assert anew == {suite.folders["ensemble"] / "weights.safetensors"}
+
+
+def test_unknown_models_and_bad_budgets_are_refused_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="did you mean 'ensemble'"):
+        build_suite("hopper-medium", tmp_path, TINY, models=["ensembles"], progress=False)
+    with pytest.raises(UserError, match=r"updates is 1500: take a multiple of its updates_per_epoch \(1000\)"):
+        build_suite("hopper-medium", tmp_path, replace(TINY, updates=1_500), progress=False)
+    with pytest.raises(UserError, match="elites is 4 and members is 3"):
+        build_suite("hopper-medium", tmp_path, replace(TINY, ensemble=replace(ENSEMBLE, elites=4)), progress=False)
+    assert list(tmp_path.iterdir()) == []
