@@ -23,6 +23,7 @@ from envtf_lit.params import DownloadOptions, EnsembleOptions, Params, Precision
 from envtf_lit.storage import read_json, write_json
 from envtf_lit.tasks import Robot, get_task
 from envtf_lit.validation import check_world_model
+from envtf_lit.world_models.recalibration import calibration_split
 
 MODELS = ("transformer", "context_1", "ensemble")  # their names in every table, figure and file
 WORK = Path(".envtf/suite")  # where suites are kept unless told otherwise
@@ -70,8 +71,9 @@ class Suite:
     seconds: dict[str, float]
 
     def split(self) -> tuple[OfflineDataset, OfflineDataset]:
-        """The episodes that every model was trained on, and those that none was."""
-        return load_dataset(self.dataset).split(TrainModelOptions().held_out, seed=self.options.seed)
+        """The episodes that every model was trained on, and those that none was trained or calibrated on."""
+        training, held_out = load_dataset(self.dataset).split(TrainModelOptions().held_out, seed=self.options.seed)
+        return training, calibration_split(held_out)[1]
 
 
 def build_suite(

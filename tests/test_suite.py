@@ -27,7 +27,7 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(tmp_path: Path
     assert isinstance(context_1, EnvironmentTransformer) and context_1.options.context == 1
     assert isinstance(ensemble, EnsembleDynamics) and ensemble.members == 3
     training, held_out = suite.split()
-    assert len(training) + len(held_out) == 1_000
+    assert len(training) > 500 and len(held_out) > 0
 
     written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
     assert build_suite("hopper-medium", tmp_path, TINY, progress=False) == suite
