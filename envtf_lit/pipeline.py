@@ -28,8 +28,9 @@ ALGORITHMS = ("cql", "et_cql")
 
 def download(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
     """Makes or reads the dataset: `data/dataset.h5` and its card, which is returned."""
+    from envtf_lit.data.cards import dataset_card
     from envtf_lit.data.formats import save_dataset
-    from envtf_lit.data.sources import dataset_card, make_dataset
+    from envtf_lit.data.sources import make_dataset
 
     with _stage("download", params, root):
         dataset, origin = make_dataset(

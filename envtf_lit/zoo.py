@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from envtf_lit.data.behaviour import Series, collect, describe_origin, plan, read_series
-from envtf_lit.data.cards import card_page, markdown_table
+from envtf_lit.data.cards import card_page, dataset_card, markdown_table
 from envtf_lit.data.formats import load_dataset, save_dataset
-from envtf_lit.data.sources import dataset_card
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.evidence import dataset_scores
 from envtf_lit.figures.zoo import score_distributions

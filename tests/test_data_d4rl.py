@@ -13,9 +13,10 @@ import pytest
 from web import Server, serving
 
 from envtf_lit.data import d4rl
+from envtf_lit.data.cards import dataset_card
 from envtf_lit.data.d4rl import FILES, VELOCITIES, load_d4rl, read_d4rl, remote_file
 from envtf_lit.data.fetch import RemoteFile
-from envtf_lit.data.sources import dataset_card, make_dataset
+from envtf_lit.data.sources import make_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.params import DownloadOptions
 from envtf_lit.tasks import TASKS, get_task

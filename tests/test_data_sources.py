@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from envtf_lit.data.behaviour import collect
+from envtf_lit.data.cards import dataset_card
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import save_dataset
 from envtf_lit.data.minari_sets import write_minari
-from envtf_lit.data.sources import dataset_card, make_dataset
+from envtf_lit.data.sources import make_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.params import DownloadOptions
 from envtf_lit.tasks import get_task

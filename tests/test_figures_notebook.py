@@ -72,7 +72,7 @@ def lost_experiment(tmp_path_factory) -> Path:
     from analytic import linear_data, linear_world
     from PIL import Image
 
-    from envtf_lit.data.sources import dataset_card
+    from envtf_lit.data.cards import dataset_card
     from envtf_lit.evaluation.evidence import collect_metrics, world_model_metrics
     from envtf_lit.evaluation.returns import Episode, Returns
     from envtf_lit.figures import gallery

@@ -1,7 +1,59 @@
-"""A dataset's card as a page to read."""
+"""A dataset's card: what it holds and where it came from, as JSON and as a page to read."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
+
+import numpy as np
+
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.tasks import get_task
+
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+
+def dataset_card(dataset: OfflineDataset, source: str, origin: dict[str, Any]) -> dict[str, Any]:
+    """What a dataset holds and how it came about, ready for JSON.
+
+    Args:
+        dataset: all of it.
+        source: as in `DownloadOptions`.
+        origin: what `sources.make_dataset` says of it.
+
+    Returns:
+        task, source, transitions, episodes, terminated and truncated episodes, steps per episode, the distribution of
+        episode returns, D4RL-normalised scores where the robot is known (and the source is not Minari, whose sets have
+        no such scores), the environment that scores policies, and the origin.
+    """
+    lengths = dataset.episode_lengths
+    card: dict[str, Any] = {
+        "task": dataset.task,
+        "source": source,
+        "transitions": len(dataset),
+        "episodes": len(lengths),
+        "terminated": int(dataset.terminated.sum()),
+        "truncated": int((dataset.truncated & ~dataset.terminated).sum()),
+        "episode_steps": {"min": int(lengths.min()), "mean": float(lengths.mean()), "max": int(lengths.max())},
+        "returns": distribution(dataset.episode_returns),
+    }
+    if dataset.task is not None:
+        robot = get_task(dataset.task).robot
+        card["env_id"] = robot.env_id
+        if source != "minari":
+            mean, best = float(dataset.episode_returns.mean()), float(dataset.episode_returns.max())
+            card["scores"] = {"mean": robot.normalised_score(mean), "max": robot.normalised_score(best)}
+    return card | origin
+
+
+def distribution(values: np.ndarray) -> dict[str, float]:
+    """Mean, standard deviation, least, quantiles and greatest of values (E,)."""
+    quantiles = {f"quantile_{q:g}": float(np.quantile(values, q)) for q in QUANTILES}
+    return {
+        "mean": float(values.mean()),
+        "std": float(values.std()),
+        "min": float(values.min()),
+        **quantiles,
+        "max": float(values.max()),
+    }
 
 
 def card_page(card: dict[str, Any]) -> str:

@@ -1,10 +1,8 @@
-"""Where datasets come from, and the card that says what one holds."""
+"""Where datasets come from."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from envtf_lit.data.behaviour import collect, describe_origin
 from envtf_lit.data.d4rl import load_d4rl
@@ -13,10 +11,9 @@ from envtf_lit.data.fetch import fingerprint
 from envtf_lit.data.formats import load_dataset
 from envtf_lit.data.minari_sets import describe_minari, read_minari
 from envtf_lit.params import DownloadOptions
-from envtf_lit.tasks import Task, get_task
+from envtf_lit.tasks import Task
 from envtf_lit.validation import check_download
 
-QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 MINARI_NOTE = (
     "Minari's datasets come from its own policies and are not D4RL's files: returns compare with those of policies in "
     "the same environment, and get no D4RL-normalised score here."
@@ -70,47 +67,3 @@ def make_dataset(
 def _renamed(dataset: OfflineDataset, name: str | None) -> OfflineDataset:
     """Whatever a file calls its task, a user who names none wants none."""
     return replace(dataset, task=name)
-
-
-def dataset_card(dataset: OfflineDataset, source: str, origin: dict[str, Any]) -> dict[str, Any]:
-    """What a dataset holds and how it came about, ready for JSON.
-
-    Args:
-        dataset: all of it.
-        source: as in `DownloadOptions`.
-        origin: what `make_dataset` says of it.
-
-    Returns:
-        task, source, transitions, episodes, terminated and truncated episodes, steps per episode, the distribution of
-        episode returns, D4RL-normalised scores where the robot is known (and the source is not Minari, whose sets have
-        no such scores), the environment that scores policies, and the origin.
-    """
-    lengths = dataset.episode_lengths
-    card: dict[str, Any] = {
-        "task": dataset.task,
-        "source": source,
-        "transitions": len(dataset),
-        "episodes": len(lengths),
-        "terminated": int(dataset.terminated.sum()),
-        "truncated": int((dataset.truncated & ~dataset.terminated).sum()),
-        "episode_steps": {"min": int(lengths.min()), "mean": float(lengths.mean()), "max": int(lengths.max())},
-        "returns": _distribution(dataset.episode_returns),
-    }
-    if dataset.task is not None:
-        robot = get_task(dataset.task).robot
-        card["env_id"] = robot.env_id
-        if source != "minari":
-            mean, best = float(dataset.episode_returns.mean()), float(dataset.episode_returns.max())
-            card["scores"] = {"mean": robot.normalised_score(mean), "max": robot.normalised_score(best)}
-    return card | origin
-
-
-def _distribution(values: np.ndarray) -> dict[str, float]:
-    quantiles = {f"quantile_{q:g}": float(np.quantile(values, q)) for q in QUANTILES}
-    return {
-        "mean": float(values.mean()),
-        "std": float(values.std()),
-        "min": float(values.min()),
-        **quantiles,
-        "max": float(values.max()),
-    }

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from envtf_lit.data.cards import distribution
 from envtf_lit.figures.style import drawing, write_table
 from envtf_lit.tasks import TIERS, get_task
 
@@ -46,9 +47,6 @@ def score_distributions(scores: Mapping[str, np.ndarray], path: str | Path) -> P
 
 
 def _table(scores: Mapping[str, np.ndarray]) -> pd.DataFrame:
-    quantiles = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
     return pd.DataFrame(
-        {"task": name, "episodes": len(values), "mean": values.mean(), "std": values.std()}
-        | {f"quantile_{q:g}": np.quantile(values, q) for q in quantiles}
-        for name, values in scores.items()
+        {"task": name, "episodes": len(values)} | distribution(values) for name, values in scores.items()
     )
