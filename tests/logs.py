@@ -8,6 +8,7 @@ import numpy as np
 
 from envtf_lit.data.dataset import COLUMNS, OfflineDataset
 
+COMPRESSION: dict[str, Any] = {"chunks": True, "compression": "gzip", "shuffle": True}
 KEYS = ("observations", "actions", "rewards", "next_observations", "terminals", "timeouts")
 Columns = dict[str, Any]
 
@@ -28,17 +29,18 @@ def columns(observation_dim: int = 11, action_dim: int = 3) -> Columns:
     }
 
 
-def write(path: Path, content: Columns) -> Path:
+def write(path: Path, content: Columns, *, compressed: bool = False) -> Path:
     """The content as HDF5 or NPZ, by the path's ending."""
     if path.suffix == ".npz":
-        np.savez(path, allow_pickle=True, **content)
+        (np.savez_compressed if compressed else np.savez)(path, allow_pickle=True, **content)
         return path
     with h5py.File(path, "w") as file:
         for name, value in content.items():
             if name in ("task", "action_low", "action_high"):
                 file.attrs[name] = value
             else:
-                file[name] = value
+                chunked = compressed and np.ndim(value) > 0 and np.size(value) > 0
+                file.create_dataset(name, data=value, **(COMPRESSION if chunked else {}))
     return path
 
 
