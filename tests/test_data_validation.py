@@ -65,7 +65,7 @@ BAD = {
     "no rewards": (drop("rewards"), "there are no 'rewards'"),
     "no terminals": (drop("terminated"), "there is no 'terminated' (or 'terminals')"),
     "no timeouts": (drop("truncated"), "there is no 'truncated' (or 'timeouts'): store both flags"),
-    "short": (change("actions", lambda x: x[:-1]), "'actions' has 11 rows and 'rewards' has 12"),
+    "short": (change("actions", lambda x: x[:-1]), "'actions' has 11 rows and 'observations' has 12"),
     "rank 1": (change("observations", lambda x: x[:, 0]), "'observations' has shape (12,): reshape it to"),
     "rank 2": (change("rewards", lambda x: x[:, None]), "'rewards' has shape (12, 1)"),
     "scalar": (put("rewards", 1.0), "'rewards' has shape ()"),
@@ -101,6 +101,20 @@ def test_bad_content_is_named_with_its_fix(case: str):
     found = errors(content)
     assert any(message in text for text in found), found
     assert not any("\n" in text for text in found)
+
+
+@pytest.mark.parametrize("case", ["short", "rank 1", "rank 2", "scalar", "narrow", "no dimensions", "zero rows"])
+def test_one_misshapen_column_is_one_error(case: str):
+    content = columns()
+    BAD[case][0](content)
+    assert len(errors(content)) == 1
+
+
+def test_the_odd_length_is_that_of_the_fewest_columns():
+    content = columns()
+    for name in ("rewards", "actions"):
+        content[name] = content[name][:-1]
+    assert [text.split(" has")[0] for text in errors(content)] == ["'actions'", "'rewards'"]
 
 
 def test_all_errors_come_at_once_and_the_first_is_the_sentence_of_loading():

@@ -1,5 +1,6 @@
 """Every check a dataset passes once, on its way in: what comes out is complete, finite and consistent."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -137,19 +138,24 @@ def _missing(columns: Set[str]) -> Iterator[Finding]:
 
 
 def _misshapen(columns: Mapping[str, Any]) -> Iterator[Finding]:
+    """At most one finding for each column, though what is wrong with one shape contradicts several others."""
+    sound: dict[str, tuple[int, ...]] = {}
     for name, values in columns.items():
         if len(values.shape) != RANKS[name]:
             want = "(N, dimensions)" if RANKS[name] == 2 else "(N,)"
             yield Finding("error", f"{name!r} has shape {values.shape}", f"reshape it to {want}")
         elif 0 in values.shape:
             yield Finding("error", f"{name!r} has shape {values.shape}, which is empty", "collect some transitions")
-    lengths = {name: values.shape[0] for name, values in columns.items() if values.shape}
-    rows = lengths.get("rewards")
-    for name, length in lengths.items():
-        if rows is not None and length != rows:
-            what = f"{name!r} has {length} rows and 'rewards' has {rows}"
+        else:
+            sound[name] = values.shape
+    lengths = Counter(shape[0] for shape in sound.values())
+    rows = max(lengths, key=lambda length: lengths[length], default=0)  # those of most columns
+    equal = {name: shape for name, shape in sound.items() if shape[0] == rows}
+    for name, shape in sound.items():
+        if shape[0] != rows:
+            what = f"{name!r} has {shape[0]} rows and {next(iter(equal))!r} has {rows}"
             yield Finding("error", what, "write all columns equally long")
-    here, there = (columns[name].shape if name in columns else None for name in ("observations", "next_observations"))
+    here, there = equal.get("observations"), equal.get("next_observations")
     if here is not None and there is not None and here != there:
         yield Finding("error", f"'next_observations' has shape {there} and 'observations' {here}", "make them equal")
 
