@@ -22,16 +22,20 @@ from envtf_lit.errors import DISK_FULL, UserError, did_you_mean
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path beside `path`; on success it takes `path`'s place, on failure it is removed.
 
-    Works for a file and for a folder alike (the block creates whichever it wants).
+    The block creates a file or a folder, and what it replaces is of the same kind.
 
     Raises:
-        UserError: the disk is full or the place cannot be written.
+        UserError: the disk is full, the place cannot be written, or a folder stands where a file shall, or a file where
+            a folder shall. What was there stays.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
+        if path.exists() and path.is_dir() != temporary.is_dir():
+            kind = "folder" if path.is_dir() else "file"
+            raise UserError(f"Cannot write {path}: a {kind} of that name stands there; move it, or choose another name.")
         if path.is_dir():
             shutil.rmtree(path)
         os.replace(temporary, path)
@@ -40,12 +44,16 @@ def replacing(path: str | Path) -> Iterator[Path]:
             raise UserError(f"No space left while writing {path}: free some disk space and run again.") from error
         if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
             raise UserError(f"Cannot write {path}: {error.strerror}; choose a folder you may write to.") from error
+        if error.filename is not None and temporary.is_relative_to(error.filename):  # else it is about something else
+            blocker = next((parent for parent in path.parents if parent.is_file()), None)
+            reason = f"{blocker} is a file, not a folder" if blocker else error.strerror
+            raise UserError(f"Cannot write {path}: {reason}; choose another place.") from error
         raise
     finally:
-        if temporary.is_dir():
+        if os.path.isdir(temporary):  # these two say no where pathlib's would raise: below a file, of a long name
             shutil.rmtree(temporary)
-        else:
-            temporary.unlink(missing_ok=True)
+        elif os.path.lexists(temporary):
+            temporary.unlink()
 
 
 def write_json(path: str | Path, content: Any) -> None:

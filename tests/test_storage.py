@@ -13,7 +13,7 @@ import torch
 from envtf_lit.errors import UserError
 from envtf_lit.params import ModelOptions
 from envtf_lit.policy import TanhGaussianActor, load_policy, save_policy
-from envtf_lit.storage import load_weights, write_json
+from envtf_lit.storage import load_weights, replacing, write_json
 from envtf_lit.world_models.store import load_world_model, save_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
@@ -79,6 +79,43 @@ def test_each_loader_takes_its_own_kind_alone(policy: Path, tmp_path: Path) -> N
         load_world_model(policy)
     with pytest.raises(UserError, match="does not fit the model"):
         load_weights(model, policy / "weights.safetensors")
+
+
+def test_a_place_below_a_file_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    for path in (tmp_path / "file/numbers.json", tmp_path / "file/deeper/numbers.json"):
+        with pytest.raises(UserError, match=r"numbers\.json: .*file is a file, not a folder; choose another place"):
+            write_json(path, [1])
+    with pytest.raises(UserError, match="File name too long; choose another place"):
+        write_json(tmp_path / ("x" * 300), [1])
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_folder_that_goes_while_it_is_written_to_is_named(tmp_path: Path) -> None:
+    with (
+        pytest.raises(UserError, match="No such file or directory; choose another place"),
+        replacing(tmp_path / "folder/file") as temporary,
+    ):
+        (tmp_path / "folder").rmdir()
+        temporary.write_text("")
+
+
+def test_what_the_block_cannot_read_is_not_blamed_on_the_place(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), replacing(tmp_path / "file"):
+        (tmp_path / "input").read_text()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_never_takes_the_place_of_a_folder_nor_a_folder_that_of_a_file(policy: Path, tmp_path: Path) -> None:
+    before = sorted(policy.iterdir())
+    with pytest.raises(UserError, match="policy: a folder of that name stands there"):
+        write_json(policy, [1])
+    assert sorted(policy.iterdir()) == before
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(UserError, match="file: a file of that name stands there"):
+        save_policy(tmp_path / "file", load_policy(policy))
+    assert (tmp_path / "file").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "policy"]
 
 
 FULL_DISK = """
