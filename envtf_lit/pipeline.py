@@ -231,7 +231,7 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
     from envtf_lit.world_models.recalibration import calibration_split
     from envtf_lit.world_models.store import load_world_model
 
-    options, robot = params.evaluate, _robot(params)
+    options, robot, source = params.evaluate, _robot(params), params.download.source
     with _stage("evaluate", params, root):
         dataset, rollouts = load_dataset(root / DATASET), load_rollouts(root / ROLLOUTS)
         model = load_world_model(root / WORLD_MODEL)
@@ -251,7 +251,7 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         with replacing(root / PLOTS) as plots, replacing(root / VIDEO) as video:
             plots.mkdir()
             video.mkdir()
-            gallery.draw_dataset(dataset, plots)
+            gallery.draw_dataset(dataset, source, plots)
             gallery.draw_world_model(report, scale, robot, pd.read_csv(root / WORLD_MODEL / "curves.csv"), plots)
             gallery.draw_rollouts(rollouts.step.numpy(), rollouts.uncertainty.numpy(), plots)
             if robot is None:
@@ -264,8 +264,8 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
                     name: evaluate_policy(policy, robot, episodes=options.episodes, seed=params.seed, progress=progress)
                     for name, policy in policies.items()
                 }
-                metrics = collect_metrics(returns, task=str(params.task), robot=robot, **facts)
-                gallery.draw_policies(dataset, robot, returns, curves, plots)
+                metrics = collect_metrics(returns, task=str(params.task), source=source, robot=robot, **facts)
+                gallery.draw_policies(dataset, source, robot, returns, curves, plots)
                 episode, gif = returns["et_cql"].median, video / "real_vs_imagined.gif"
                 real_vs_imagined(model, episode, robot, scale, gif, frames=options.video_frames)
         write_json(root / METRICS, metrics)

@@ -35,7 +35,9 @@ def replacing(path: str | Path) -> Iterator[Path]:
         yield temporary
         if path.exists() and path.is_dir() != temporary.is_dir():
             kind = "folder" if path.is_dir() else "file"
-            raise UserError(f"Cannot write {path}: a {kind} of that name stands there; move it, or choose another name.")
+            raise UserError(
+                f"Cannot write {path}: a {kind} of that name stands there; move it, or choose another name."
+            )
         if path.is_dir():
             shutil.rmtree(path)
         os.replace(temporary, path)

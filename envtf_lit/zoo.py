@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from envtf_lit.data.behaviour import Series, collect, describe_origin, plan, read_series
+from envtf_lit.data.behaviour import NOT_D4RL, Series, collect, describe_origin, plan, read_series
 from envtf_lit.data.cards import card_page, dataset_card, markdown_table
 from envtf_lit.data.formats import load_dataset, save_dataset
 from envtf_lit.errors import UserError
@@ -138,7 +138,7 @@ def _entry(card: dict[str, Any]) -> Entry:
 def _scores(entries: Sequence[Entry], out: Path) -> dict[str, Any]:
     """Each dataset's D4RL-normalised scores, (episodes,)."""
     datasets = ((entry.task, load_dataset(out / f"{entry.task}.h5")) for entry in entries)
-    return {name: dataset_scores(dataset, get_task(name).robot) for name, dataset in datasets}
+    return {name: dataset_scores(dataset, get_task(name).robot, "zoo") for name, dataset in datasets}
 
 
 def index_page(entries: Sequence[Entry]) -> str:
@@ -158,8 +158,8 @@ def index_page(entries: Sequence[Entry]) -> str:
         for entry in entries
     )
     note = (
-        "Scores are D4RL-normalised returns of the episodes (0 a random policy, 100 D4RL's expert). These are not "
-        "D4RL's files: scores compare among themselves, not with D4RL's tables."
+        "Scores are D4RL-normalised returns of the episodes (0 a random policy, 100 D4RL's expert), less those cut "
+        f"short where the rows of a policy end. {NOT_D4RL}"
     )
     return f"# The zoo's datasets\n\n{markdown_table(head, rows)}\n\n{note}\n\n![Scores of their episodes]({FIGURE})\n"
 

@@ -1,5 +1,7 @@
 """The keys and values of reports/metrics.json."""
 
+import json
+
 import numpy as np
 import pytest
 from analytic import linear_data, linear_world
@@ -18,8 +20,7 @@ def returns(values: list[float]) -> Returns:
     return Returns(returns=array, lengths=np.ones(len(values)), scores=scores, median=episode)
 
 
-@pytest.fixture(scope="module")
-def metrics() -> dict:
+def collect(source: str) -> dict:
     data, scale = linear_data((20, 30, 25), noise=0.05), Scale.of(linear_data((20, 30, 25), noise=0.05))
     report = horizon_report(linear_world(std=0.05), whole_episodes(data, 3, seed=0), scale)
     return collect_metrics(
@@ -27,10 +28,16 @@ def metrics() -> dict:
         task="hopper-medium-replay",
         seed=7,
         dataset=data,
+        source=source,
         robot=ROBOTS["hopper"],
         world_model=world_model_metrics(report, scale, parameters=123),
         rollouts=456,
     )
+
+
+@pytest.fixture(scope="module")
+def metrics() -> dict:
+    return collect("zoo")
 
 
 def test_keys_are_exactly_those_promised(metrics):
@@ -66,7 +73,21 @@ def test_values_survive_json_and_are_right(metrics, tmp_path):
     assert 0.3 < metrics["world_model"]["coverage_50"] < 0.7
 
 
+def test_minaris_data_are_never_set_beside_d4rls_scores():
+    metrics = collect("minari")
+    assert "score" not in json.dumps(metrics)
+    data = linear_data((20, 30, 25), noise=0.05)
+    assert metrics["dataset"] == {
+        "transitions": 75,
+        "episodes": 3,
+        "return_mean": pytest.approx(data.episode_returns.mean()),
+        "return_max": pytest.approx(data.episode_returns.max()),
+    }
+    assert metrics["policy"] == {"return_mean": 200.0, "return_std": 100.0, "episodes": 2}
+    assert metrics["baselines"]["bc"] == {"return_mean": 50.0, "return_std": 0.0}
+
+
 def test_dataset_scores_are_those_of_its_episodes():
     data = linear_data((4, 6))
     expected = [ROBOTS["hopper"].normalised_score(float(data.rewards[a:b].sum())) for a, b in ((0, 4), (4, 10))]
-    np.testing.assert_allclose(dataset_scores(data, ROBOTS["hopper"]), expected, rtol=1e-5)
+    np.testing.assert_allclose(dataset_scores(data, ROBOTS["hopper"], "zoo"), expected, rtol=1e-5)

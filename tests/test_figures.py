@@ -44,11 +44,11 @@ def draw_all(folder: Path) -> Path:
     data = linear_data((60, 90, 40, 70, 55, 80), noise=0.02)
     scale = Scale.of(data)
     report = horizon_report(linear_world(0.02, std=0.02), whole_episodes(data, 6, seed=0), scale)
-    gallery.draw_dataset(data, folder)
+    gallery.draw_dataset(data, "zoo", folder)
     gallery.draw_world_model(report, scale, HOPPER, WORLD_MODEL_CURVES, folder)
     gallery.draw_rollouts(np.repeat(np.arange(3), 50), np.linspace(0.1, 1.0, 150), folder)
     returns = {name: some_returns(level) for name, level in (("bc", 5.0), ("cql", 20.0), ("et_cql", 30.0))}
-    gallery.draw_policies(data, HOPPER, returns, {"cql": POLICY_CURVES, "et_cql": POLICY_CURVES + 1}, folder)
+    gallery.draw_policies(data, "zoo", HOPPER, returns, {"cql": POLICY_CURVES, "et_cql": POLICY_CURVES + 1}, folder)
     return folder
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import papermill
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+from reports import said
 
 from envtf_lit.errors import UserError
 from envtf_lit.figures.notebook import execute
@@ -65,9 +66,8 @@ def test_the_report_names_its_parameters_and_is_stripped():
     assert subprocess.run([program, "--verify", str(REPORT)], capture_output=True, check=False).returncode == 0
 
 
-@pytest.fixture(scope="module")
-def lost_experiment(tmp_path_factory) -> Path:
-    """What the stages before the report write, for an experiment that went against us."""
+def lost_experiment(root: Path, source: str) -> Path:
+    """What the stages before the report write, for an experiment that went against us; the report on it."""
     import pandas as pd
     from analytic import linear_data, linear_world
     from PIL import Image
@@ -81,7 +81,7 @@ def lost_experiment(tmp_path_factory) -> Path:
     from envtf_lit.tasks import ROBOTS
     from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
 
-    root, hopper, data = tmp_path_factory.mktemp("root"), ROBOTS["hopper"], linear_data((40, 50), noise=0.02)
+    hopper, data = ROBOTS["hopper"], linear_data((40, 50), noise=0.02)
     model_curves = pd.DataFrame({"epoch": [1], "train/loss": [1.0], "val/loss": [1.1], "val/open_loop_error": [0.2]})
     policy_curves = pd.DataFrame({"epoch": [1], "train/q_data": [3.0]})
     for name, curves in (
@@ -97,27 +97,32 @@ def lost_experiment(tmp_path_factory) -> Path:
         returns[name] = Returns(returns=values, lengths=np.ones(3), scores=scores, median=episode)
     scale, plots = Scale.of(data), root / "reports/plots"
     report = horizon_report(linear_world(0.02, std=0.02), whole_episodes(data, 1, seed=0), scale)
-    gallery.draw_dataset(data, plots)
+    gallery.draw_dataset(data, source, plots)
     gallery.draw_world_model(report, scale, hopper, model_curves, plots)
     gallery.draw_rollouts(np.zeros(9, dtype=int), np.linspace(0.1, 1.0, 9), plots)
-    gallery.draw_policies(data, hopper, returns, {"cql": policy_curves, "et_cql": policy_curves}, plots)
+    gallery.draw_policies(data, source, hopper, returns, {"cql": policy_curves, "et_cql": policy_curves}, plots)
     write_gif([Image.new("RGB", (8, 8))], root / "reports/video/real_vs_imagined.gif")
     metrics = collect_metrics(
-        returns, task="hopper-medium-replay", seed=3, dataset=data, robot=hopper, rollouts=9,
+        returns, task="hopper-medium-replay", seed=3, dataset=data, source=source, robot=hopper, rollouts=9,
         world_model=world_model_metrics(report, scale, parameters=12),
     )  # fmt: skip
     write_json(root / "reports/metrics.json", metrics)
-    write_json(root / "data/dataset.json", dataset_card(data, "file", {"path": "my.h5"}))
-    return root
+    write_json(root / "data/dataset.json", dataset_card(data, source, {"path": "my.h5", "note": "A note."}))
+    return execute(REPORT, root / "reports/report.ipynb", {"root": "."}, cwd=root)
 
 
-def test_the_report_prints_a_result_against_us_as_such(lost_experiment):
-    page = execute(REPORT, lost_experiment / "reports/report.ipynb", {"root": "."}, cwd=lost_experiment)
-    executed = nbformat.read(lost_experiment / "reports/report.ipynb", 4)
-    outputs = [output for cell in executed.cells if cell.cell_type == "code" for output in cell.outputs]
-    said = " ".join(output.data["text/markdown"] for output in outputs if "text/markdown" in output.get("data", {}))
-    assert "not above the behaviour clone, CQL on data alone" in said
-    assert "Imagination **hurt**: -21.5 points" in said
-    assert "it **hurt**: -21.5 points" in said
-    assert not [output for output in outputs if output.output_type == "stream" and output.name == "stderr"]
+def test_the_report_prints_a_result_against_us_as_such(tmp_path):
+    page = lost_experiment(tmp_path, "file")
+    text = said(page.with_suffix(".ipynb"))
+    assert "not above the behaviour clone, CQL on data alone" in text
+    assert "Imagination **hurt**: -21.5 points" in text
+    assert "it **hurt**: -21.5 points" in text
     assert page.stat().st_size > 100_000
+
+
+def test_the_report_on_minaris_data_speaks_of_returns(tmp_path):
+    text = said(lost_experiment(tmp_path, "minari").with_suffix(".ipynb"))
+    assert "Scores are D4RL's" not in text and "points" not in text
+    assert "with imagination returns **201.0**" in text
+    assert "Imagination **hurt**: -700.0 of return" in text
+    assert text.count("A note.") == 2  # beside the table, and where the log is said to come from

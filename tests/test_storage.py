@@ -92,12 +92,13 @@ def test_a_place_below_a_file_is_refused_in_a_sentence(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_goes_while_it_is_written_to_is_named(tmp_path: Path) -> None:
-    with (
-        pytest.raises(UserError, match="No such file or directory; choose another place"),
-        replacing(tmp_path / "folder/file") as temporary,
-    ):
-        (tmp_path / "folder").rmdir()
-        temporary.write_text("")
+    def write() -> None:
+        with replacing(tmp_path / "folder/file") as temporary:
+            (tmp_path / "folder").rmdir()
+            temporary.write_text("")
+
+    with pytest.raises(UserError, match="No such file or directory; choose another place"):
+        write()
 
 
 def test_what_the_block_cannot_read_is_not_blamed_on_the_place(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ ZOO = Path(__file__).parent.parent / "assets" / "zoo"
 ENVIRONMENTS = 8  # per unit of work; a constant, since the policy's rounding may depend on the batch size
 UNIT_ROWS = 24_000  # at most, per unit of work: three episodes of 1,000 steps in each environment, so none is wasted
 MIN_ROWS = 2  # of a phase and of an episode
+NOT_D4RL = "These are not D4RL's files: scores compare among themselves, not with D4RL's tables."
 HIDDEN_DYNAMICS = (
     f"friction, mass and actuator strength are drawn in each episode, each uniform in [{LOW}, {HIGH}] times nominal, "
     "and are not observed; the policies were trained, and their returns measured, on the nominal robot"
@@ -205,10 +206,7 @@ def describe_origin(task: Task, transitions: int, seed: int, zoo: Path | None = 
         "policies": policies,
         "trained_with": series.trained_with,
         "versions": {**versions, "python": platform.python_version()},
-        "note": (
-            f"Collected in {robot.env_id} by this package's own behaviour policies: these are not D4RL's files, and "
-            "scores compare among themselves, not with D4RL's tables."
-        ),
+        "note": f"Collected in {robot.env_id} by this package's own behaviour policies. {NOT_D4RL}",
     }
 
 

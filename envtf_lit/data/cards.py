@@ -9,6 +9,30 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.tasks import get_task
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+UNLIMITED = ("file", "minari")  # sources that say nothing of the time limit under which they were recorded
+UNSCORED = ("minari",)  # sources whose returns D4RL's references have nothing to do with
+
+
+def cut_short(dataset: OfflineDataset, source: str) -> np.ndarray:
+    """(E,) bool, the episodes that neither terminated nor came to the robot's time limit.
+
+    They are cut where the rows of a policy, or of the log, end: what they would have returned nobody knows. None is,
+    as far as can be told, where the robot is unknown or the source may have had a limit of its own.
+
+    Args:
+        dataset: all of it.
+        source: as in `DownloadOptions`.
+    """
+    if dataset.task is None or source in UNLIMITED:
+        return np.zeros(len(dataset.episode_starts), bool)
+    limit = get_task(dataset.task).robot.max_episode_steps
+    return ~dataset.terminated[dataset.episode_ends - 1] & (dataset.episode_lengths < limit)
+
+
+def counted_episodes(dataset: OfflineDataset, source: str) -> np.ndarray:
+    """(E,) bool, the episodes whose returns count: those that are not cut short, or all where there are no others."""
+    cut = cut_short(dataset, source)
+    return ~cut | cut.all()
 
 
 def dataset_card(dataset: OfflineDataset, source: str, origin: dict[str, Any]) -> dict[str, Any]:
@@ -20,26 +44,29 @@ def dataset_card(dataset: OfflineDataset, source: str, origin: dict[str, Any]) -
         origin: what `sources.make_dataset` says of it.
 
     Returns:
-        task, source, transitions, episodes, terminated and truncated episodes, steps per episode, the distribution of
-        episode returns, D4RL-normalised scores where the robot is known (and the source is not Minari, whose sets have
-        no such scores), the environment that scores policies, and the origin.
+        task, source, transitions, episodes, terminated and truncated episodes, how many of the latter are cut short
+        (and left out of what follows, unless all are), steps per episode, the distribution of their returns,
+        D4RL-normalised scores where the robot is known (and the source is not Minari, whose sets have no such scores),
+        the environment that scores policies, and the origin.
     """
-    lengths = dataset.episode_lengths
+    counted = counted_episodes(dataset, source)
+    lengths, returns = dataset.episode_lengths[counted], dataset.episode_returns[counted]
     card: dict[str, Any] = {
         "task": dataset.task,
         "source": source,
         "transitions": len(dataset),
-        "episodes": len(lengths),
+        "episodes": len(counted),
         "terminated": int(dataset.terminated.sum()),
         "truncated": int((dataset.truncated & ~dataset.terminated).sum()),
+        "cut_short": int(cut_short(dataset, source).sum()),
         "episode_steps": {"min": int(lengths.min()), "mean": float(lengths.mean()), "max": int(lengths.max())},
-        "returns": distribution(dataset.episode_returns),
+        "returns": distribution(returns),
     }
     if dataset.task is not None:
         robot = get_task(dataset.task).robot
         card["env_id"] = robot.env_id
-        if source != "minari":
-            mean, best = float(dataset.episode_returns.mean()), float(dataset.episode_returns.max())
+        if source not in UNSCORED:
+            mean, best = float(returns.mean()), float(returns.max())
             card["scores"] = {"mean": robot.normalised_score(mean), "max": robot.normalised_score(best)}
     return card | origin
 
@@ -64,7 +91,7 @@ def card_page(card: dict[str, Any]) -> str:
         **({"hidden dynamics": card["hidden_dynamics"]} if "hidden_dynamics" in card else {}),
         "transitions": f"{card['transitions']:,}",
         "episodes": f"{card['episodes']:,}, of which {card['terminated']:,} terminated and {card['truncated']:,} were "
-        "truncated",
+        f"truncated{_cut(card)}",
         "steps per episode": f"{steps['mean']:.0f} on average, from {steps['min']:,} to {steps['max']:,}",
         "D4RL-normalised score of its episodes": f"{scores['mean']:.1f} on average, at most {scores['max']:.1f}",
         "seed": card["seed"],
@@ -96,6 +123,12 @@ def card_page(card: dict[str, Any]) -> str:
         )
         + "\n"
     )
+
+
+def _cut(card: dict[str, Any]) -> str:
+    count = card["cut_short"]
+    left_out = "" if count == card["episodes"] else ", and left out below"
+    return f" ({count:,} of them cut short where a policy's rows end{left_out})" if count else ""
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from envtf_lit.data.cards import UNSCORED, counted_episodes
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.calibration import coverage
 from envtf_lit.evaluation.offline import Promises
@@ -13,9 +14,24 @@ from envtf_lit.tasks import Robot
 from envtf_lit.world_models.horizon import HorizonReport, Scale
 
 
-def dataset_scores(dataset: OfflineDataset, robot: Robot) -> np.ndarray:
-    """(E,) D4RL-normalised score of each recorded episode."""
-    return np.array([robot.normalised_score(value) for value in dataset.episode_returns])
+def dataset_scores(dataset: OfflineDataset, robot: Robot, source: str) -> np.ndarray:
+    """(E,) D4RL-normalised score of each recorded episode that counts (see `counted_episodes`)."""
+    counted = dataset.episode_returns[counted_episodes(dataset, source)]
+    return np.array([robot.normalised_score(value) for value in counted])
+
+
+def comparable(
+    dataset: OfflineDataset, returns: Mapping[str, Returns], robot: Robot, source: str
+) -> tuple[str, dict[str, np.ndarray]]:
+    """The unit in which policies are compared with the data, and in it each one's episodes (E,), first the `data`'s.
+
+    The unit is `score`, D4RL's, or `return` where the data are Minari's, whose sets D4RL's references do not belong to.
+    """
+    if source in UNSCORED:
+        recorded = dataset.episode_returns[counted_episodes(dataset, source)]
+        return "return", {"data": recorded} | {name: found.returns for name, found in returns.items()}
+    scores = {name: found.scores for name, found in returns.items()}
+    return "score", {"data": dataset_scores(dataset, robot, source)} | scores
 
 
 def world_model_metrics(report: HorizonReport, scale: Scale, *, parameters: int) -> dict[str, Any]:
@@ -43,6 +59,7 @@ def collect_metrics(
     task: str,
     seed: int,
     dataset: OfflineDataset,
+    source: str,
     robot: Robot,
     world_model: Mapping[str, Any],
     rollouts: int,
@@ -54,34 +71,36 @@ def collect_metrics(
         task: name of the task.
         seed: of the experiment.
         dataset: the whole of it, held-out episodes included.
+        source: of the dataset, as in `DownloadOptions`; there are no scores where it is Minari.
         robot: gives the scores their scale.
         world_model: of `world_model_metrics`.
         rollouts: imagined transitions stored by `generate_rollouts`.
     """
-    recorded, policy = dataset_scores(dataset, robot), returns["et_cql"]
+    unit, episodes = comparable(dataset, returns, robot, source)
+    recorded, policy = episodes["data"], returns["et_cql"]
+    found = {name: _spread(unit, episodes[name]) for name in returns}
     return {
         "task": task,
         "seed": seed,
         "dataset": {
             "transitions": len(dataset),
-            "episodes": len(recorded),
-            "score_mean": float(recorded.mean()),
-            "score_max": float(recorded.max()),
+            "episodes": len(dataset.episode_starts),
+            f"{unit}_mean": float(recorded.mean()),
+            f"{unit}_max": float(recorded.max()),
         },
         "world_model": dict(world_model),
         "rollouts": {"transitions": rollouts},
         "policy": {
-            **_score(policy),
-            "return_mean": float(policy.returns.mean()),
-            "return_std": float(policy.returns.std()),
+            **found.pop("et_cql"),
+            **_spread("return", policy.returns),
             "episodes": len(policy.returns),
         },
-        "baselines": {name: _score(found) for name, found in returns.items() if name != "et_cql"},
+        "baselines": found,
     }
 
 
-def _score(returns: Returns) -> dict[str, float]:
-    return {"score_mean": float(returns.scores.mean()), "score_std": float(returns.scores.std())}
+def _spread(unit: str, values: np.ndarray) -> dict[str, float]:
+    return {f"{unit}_mean": float(values.mean()), f"{unit}_std": float(values.std())}
 
 
 def collect_promises(

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from envtf_lit.data.cards import counted_episodes
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.evaluation.evidence import dataset_scores
+from envtf_lit.evaluation.evidence import comparable
 from envtf_lit.evaluation.offline import Promises
 from envtf_lit.evaluation.returns import Returns
 from envtf_lit.figures import learning, model, scores
@@ -16,9 +17,11 @@ from envtf_lit.tasks import Robot
 from envtf_lit.world_models.horizon import HorizonReport, Scale
 
 
-def draw_dataset(dataset: OfflineDataset, folder: Path) -> None:
-    """`dataset_returns`."""
-    scores.returns_histogram(dataset.episode_returns, dataset.episode_lengths, folder / "dataset_returns.png")
+def draw_dataset(dataset: OfflineDataset, source: str, folder: Path) -> None:
+    """`dataset_returns`, of the episodes that count (see `counted_episodes`)."""
+    counted = counted_episodes(dataset, source)
+    returns, lengths = dataset.episode_returns[counted], dataset.episode_lengths[counted]
+    scores.returns_histogram(returns, lengths, folder / "dataset_returns.png")
 
 
 def draw_world_model(
@@ -43,6 +46,7 @@ def draw_rollouts(step: np.ndarray, uncertainty: np.ndarray, folder: Path) -> No
 
 def draw_policies(
     dataset: OfflineDataset,
+    source: str,
     robot: Robot,
     returns: Mapping[str, Returns],
     curves: Mapping[str, pd.DataFrame],
@@ -51,14 +55,16 @@ def draw_policies(
     """`scores` and `policy_curves`.
 
     Args:
-        dataset: its episodes' scores stand first.
+        dataset: its episodes stand first.
+        source: of the dataset, as in `DownloadOptions`; Minari's has no scores, and returns stand in their place.
         robot: gives the scores their scale.
         returns: of `bc`, `cql`, `et_cql`, in this order.
         curves: the curves.csv of `cql` and `et_cql`.
         folder: to write into.
     """
-    by_policy = {name: result.scores for name, result in returns.items()}
-    scores.score_strip({"data": dataset_scores(dataset, robot)} | by_policy, folder / "scores.png")
+    unit, episodes = comparable(dataset, returns, robot, source)
+    words = {} if unit == "score" else {"quantity": unit, "title": "Return of every episode"}
+    scores.score_strip(episodes, folder / "scores.png", **words)
     learning.learning_curves(curves, folder / "policy_curves.png", title="Policies, in training")
 
 
