@@ -25,6 +25,9 @@ COLOURS = {
     "imagined": "#D55E00",
     "taught": "#56B4E9",
     "threshold": "#999999",
+    "transformer": "#D55E00",
+    "context_1": "#56B4E9",
+    "ensemble": "#0072B2",
 }
 LABELS = {
     "data": "dataset",
@@ -34,6 +37,9 @@ LABELS = {
     "world_model": "world model",
     "recorded": "recorded\n(held out)",
     "promised": "model, on the\nrecorded actions",
+    "transformer": "transformer",
+    "context_1": "transformer, context 1",
+    "ensemble": "ensemble",
 }
 JOINTS = {
     "hopper": ("thigh", "leg", "foot"),

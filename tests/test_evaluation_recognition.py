@@ -1,0 +1,84 @@
+"""Errors by how much a model has seen, of a model whose errors are a known function of that."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from analytic import LinearWorld, linear_data, linear_world
+from PIL import Image
+from torch import Tensor
+
+from envtf_lit.evaluation.recognition import HISTORY, Recognition, recognition, recognition_metrics, stretches
+from envtf_lit.figures.recognition import recognition_curves
+from envtf_lit.world_models.horizon import Scale
+
+
+class Remembering(LinearWorld):
+    """The true world, plus an error in the first dimension that halves with every true state it is shown."""
+
+    def init(self, observations: Tensor, actions: Tensor, lengths: Tensor, **posterior):
+        self.seen = 0
+        return super().init(observations, actions, lengths)
+
+    def observe(self, state: Tensor, observation: Tensor) -> Tensor:
+        self.seen += 1
+        return observation
+
+    def step(self, state: Tensor, action: Tensor, **draw):
+        state, prediction = super().step(state, action, **draw)
+        mistake = torch.tensor([0.5**self.seen, 0.0, 0.0, 0.0])
+        return state, replace(prediction, mean=prediction.mean + mistake)
+
+
+def remembering() -> Remembering:
+    world = linear_world()
+    return Remembering(world.matrix, world.gain)
+
+
+def test_errors_are_sorted_by_what_the_model_has_seen() -> None:
+    data = linear_data((100, 100, 30))
+    scale = Scale.of(data)
+    found = recognition(remembering(), stretches(data, 20, seed=0), scale)
+    assert found.one_step.shape == (20, 32) and found.open_loop.shape == (20, 25)
+    unit = 1.0 / (scale.std[0].item() ** 2 * int(scale.live.sum()))  # nmse of an error of one
+    expected = unit * 0.25 ** np.arange(8)
+    np.testing.assert_allclose(found.one_step[:, :8].numpy(), np.tile(expected, (20, 1)), rtol=1e-2)
+    # the open loop is shown nothing more: its error stays that after 16 steps of history
+    assert found.open_loop.max() < unit * 0.25**HISTORY * 1.1 + 1e-10
+
+
+def test_metrics_are_medians_and_shares_of_the_other_models() -> None:
+    rng = np.random.default_rng(0)
+    errors = {name: rng.lognormal(size=(11, 57)) for name in ("transformer", "context_1")}
+    found = {name: Recognition(torch.tensor(e[:, :32]), torch.tensor(e[:, 32:])) for name, e in errors.items()}
+    metrics = recognition_metrics(found)
+    medians = {name: np.median(e, axis=0) for name, e in errors.items()}
+    assert metrics["transformer.one_step"] == medians["transformer"][16]
+    assert metrics["context_1.open_loop"] == medians["context_1"][-1]
+    assert metrics["context_1.one_step_by_context"] == medians["context_1"][:32].tolist()
+    shares = medians["transformer"] / medians["context_1"]
+    assert metrics["transformer.one_step_vs_context_1"] == pytest.approx(shares[16])
+    assert metrics["transformer.open_loop_vs_context_1"] == pytest.approx(shares[-1])
+
+
+def test_the_figure_holds_every_curve(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    found = {
+        robot: {
+            name: Recognition(torch.tensor(rng.lognormal(size=(9, 32))), torch.tensor(rng.lognormal(size=(9, 25))))
+            for name in ("transformer", "context_1", "ensemble")
+        }
+        for robot in ("halfcheetah", "walker2d")
+    }
+    path = recognition_curves(found, tmp_path / "hidden.png")
+    table = pd.read_csv(path.with_suffix(".csv"))
+    assert len(table) == 2 * 3 * (32 + 25)
+    errors = found["walker2d"]["ensemble"].open_loop.numpy()
+    row = table.query("robot == 'walker2d' and model == 'ensemble' and error == 'open_loop' and at == 25").iloc[0]
+    assert row[["lower", "median", "upper"]].tolist() == pytest.approx(
+        np.quantile(errors[:, -1], (0.25, 0.5, 0.75)).tolist(), rel=1e-5
+    )
+    with Image.open(path) as figure:
+        assert figure.size[0] > 800
