@@ -4,12 +4,13 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from envtf_lit.errors import UserError
 from envtf_lit.storage import load_module, save_module
 
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
@@ -73,6 +74,31 @@ class TanhGaussianActor(nn.Module):
         high = 1.0 if action_high is None else torch.as_tensor(action_high, dtype=torch.float32)
         self.register_buffer("action_low", torch.zeros(action_dim) + low)
         self.register_buffer("action_high", torch.zeros(action_dim) + high)
+
+    @torch.no_grad()
+    def start_from(self, other: "TanhGaussianActor") -> None:
+        """Takes over another actor's layers; this one keeps its scales, which are those of its own data.
+
+        The hidden layers must be alike. A first layer for observations of the same size is taken over too, rescaled so
+        that it sees what it saw; so is a last one for actions of the same size, which then mean the same shares of the
+        range. Others begin anew.
+
+        Raises:
+            UserError: the hidden layers differ.
+        """
+        for name in ("hidden", "layer_norm", "log_std_min"):
+            mine, theirs = self.arguments[name], other.arguments[name]
+            if mine != theirs:
+                raise UserError(f"{name} is {theirs} there and {mine} here; leave it as it is there.")
+        first, last = cast(nn.Linear, self.net[0]), self.net[-1]
+        for mine, theirs in zip(self.net, other.net, strict=True):
+            if mine is not first and (mine is not last or self.action_low.shape == other.action_low.shape):
+                mine.load_state_dict(theirs.state_dict())
+        if self.observation_mean.shape == other.observation_mean.shape:
+            theirs = cast(nn.Linear, other.net[0])
+            shift = (self.observation_mean - other.observation_mean) / other.observation_std
+            first.weight.copy_(theirs.weight * (self.observation_std / other.observation_std))
+            first.bias.copy_(theirs.bias + theirs.weight @ shift)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Observation (..., S) to the mean and log standard deviation, each (..., A), before the tanh."""

@@ -4,14 +4,17 @@ import copy
 import math
 from typing import Literal
 
+import pytest
 import torch
 from torch import nn
 
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.ring import ImaginedRing
+from envtf_lit.errors import UserError
 from envtf_lit.imagination import Rollouts
 from envtf_lit.params import ImaginationOptions, PolicyOptions
+from envtf_lit.policy import TanhGaussianActor
 
 S, A, B = 3, 2, 8
 
@@ -208,3 +211,41 @@ def test_rewards_are_divided_by_the_return_scale():
     agent.return_scale.fill_(4.0)
     agent.remember(make_rollouts(2))
     assert agent.ring is not None and agent.ring.get_buffer("rewards")[:2].tolist() == [0.25, 0.25]
+
+
+# starting from another policy
+
+
+def scaled_actor(observation_dim: int, action_dim: int, seed: int, **limits) -> TanhGaussianActor:
+    torch.manual_seed(seed)
+    actor = TanhGaussianActor(observation_dim, action_dim, hidden=(16, 16), **limits)
+    actor.observation_mean.copy_(torch.randn(observation_dim))
+    actor.observation_std.copy_(0.5 + torch.rand(observation_dim))
+    return actor
+
+
+def test_an_actor_that_starts_from_another_acts_as_it_did_within_its_own_limits():
+    base, mine = scaled_actor(S, A, 0), scaled_actor(S, A, 1, action_low=[-2.0] * A, action_high=[2.0] * A)
+    scale = mine.observation_mean.clone(), mine.observation_std.clone()
+    mine.start_from(base)
+    assert torch.equal(mine.observation_mean, scale[0]) and torch.equal(mine.observation_std, scale[1])
+    observation = torch.randn(B, S)
+    torch.testing.assert_close(mine.act(observation), 2.0 * base.act(observation), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("size", "kept"), [((S + 1, A), {"2", "4"}), ((S, A + 1), {"2"}), ((S + 1, A + 1), {"2"})])
+def test_layers_for_another_robot_begin_anew(size: tuple[int, int], kept: set[str]):
+    base, mine = scaled_actor(S, A, 0), scaled_actor(*size, 1)
+    fresh = {name: value.clone() for name, value in mine.net.state_dict().items()}
+    mine.start_from(base)
+    for name, value in mine.net.state_dict().items():
+        layer = name.split(".")[0]
+        if layer in kept:
+            assert torch.equal(value, base.net.state_dict()[name])
+        else:
+            assert torch.equal(value, fresh[name]) or (layer == "0" and size[0] == S)
+
+
+def test_hidden_layers_cannot_change():
+    with pytest.raises(UserError, match=r"hidden is \[16, 16\] there and \[8\] here"):
+        TanhGaussianActor(S, A, hidden=(8,)).start_from(scaled_actor(S, A, 0))

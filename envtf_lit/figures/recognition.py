@@ -22,9 +22,7 @@ def recognition_curves(found: Mapping[str, Mapping[str, Recognition]], path: str
         found: by robot, then by model.
         path: PNG to write; the numbers go beside it as CSV.
     """
-    curves = {
-        (robot, name): _curves(errors) for robot, models in found.items() for name, errors in models.items()
-    }  # each a table by kind of error
+    curves = {(robot, name): _curves(errors) for robot, models in found.items() for name, errors in models.items()}
     with drawing(path, (10.5, 3.4 * len(found) + 0.4), len(found), 2) as (figure, axes):
         for row, (robot, models) in zip(axes, found.items(), strict=True):
             for axis, (kind, (title, label)) in zip(row, PANELS.items(), strict=True):
@@ -38,8 +36,12 @@ def recognition_curves(found: Mapping[str, Mapping[str, Recognition]], path: str
             row[0].axvline(HISTORY, color=COLOURS["threshold"], linestyle=":", linewidth=1.2)
         axes[0, 0].legend(fontsize="small")
         figure.suptitle("Each episode has a robot of its own, which no observation names (median and quartiles)")
-    parts = {(*key, kind): table for key, tables in curves.items() for kind, table in tables.items()}
-    write_table(path, pd.concat(parts, names=["robot", "model", "error"]).reset_index([0, 1, 2]))
+    tables = (
+        table.assign(robot=robot, model=name, error=kind)
+        for (robot, name), kinds in curves.items()
+        for kind, table in kinds.items()
+    )
+    write_table(path, pd.concat(tables))
     return Path(path)
 
 

@@ -54,6 +54,11 @@ class Normaliser(nn.Module):
             if name == "observation":
                 self.live.copy_(std >= CONSTANT)
 
+    def input_scale(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of what `token` z-scores, each (S + A,)."""
+        mean = torch.cat([self.observation_mean, self.action_mean])
+        return mean, torch.cat([self.observation_std, self.action_std])
+
     def token(self, observation: Tensor, action: Tensor) -> Tensor:
         """(..., S) and (..., A) to the network's input (..., S + A)."""
         return torch.cat(

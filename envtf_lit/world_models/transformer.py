@@ -170,6 +170,40 @@ class EnvironmentTransformer(nn.Module):
         """What the constructor needs to build this module again."""
         return dict(observation_dim=self.observation_dim, action_dim=self.action_dim, **asdict(self.options))
 
+    @torch.no_grad()
+    def start_from(self, other: "EnvironmentTransformer") -> None:
+        """Takes over another model's weights; this one keeps its normaliser, which knows its own data.
+
+        The blocks must be alike. A projection of the same dimensions is taken over too, rescaled so that in the data's
+        own units the model predicts what the other does (variances as far as their bounds let them); others, such as
+        those of another robot, begin anew. So do posterior and recalibration.
+
+        Raises:
+            UserError: the two differ in what the weights mean.
+        """
+        mine, theirs = asdict(self.options), asdict(other.options)
+        for name in ("layers", "heads", "width", "activation", "target"):
+            if mine[name] != theirs[name]:
+                raise UserError(f"{name} is {theirs[name]} there and {mine[name]} here; leave it as it is there.")
+        for part in ("blocks", "norm"):
+            getattr(self, part).load_state_dict(getattr(other, part).state_dict())
+        if self.observation_dim != other.observation_dim:
+            return
+        if self.action_dim == other.action_dim:
+            (old_mean, old_std), (mean, std) = other.normaliser.input_scale(), self.normaliser.input_scale()
+            self.embed.weight.copy_(other.embed.weight * (std / old_std))
+            self.embed.bias.copy_(other.embed.bias + other.embed.weight @ ((mean - old_mean) / old_std))
+        if self.head.weight.shape == other.head.weight.shape:
+            self._take_over_head(other)
+
+    def _take_over_head(self, other: "EnvironmentTransformer") -> None:
+        old, new = other.normaliser, self.normaliser
+        ratio = old.target_std / new.target_std  # (S + 1,)
+        weights, biases = other.head.weight.split(len(ratio)), other.head.bias.split(len(ratio))
+        mean = biases[0] * ratio + (old.target_mean - new.target_mean) / new.target_std
+        self.head.weight.copy_(torch.cat([weights[0] * ratio[:, None], *weights[1:]]))
+        self.head.bias.copy_(torch.cat([mean, *(bias + 2 * ratio.log() for bias in biases[1:])]))
+
     def forward(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Whole sequences (B, T, S) and (B, T, A) to mean, log-variance and epistemic log-variance, (B, T, S + 1).
 
