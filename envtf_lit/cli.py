@@ -89,6 +89,7 @@ def build_parser() -> argparse.ArgumentParser:
         command.add_argument("--preset", default="small", help="tiny, small, base or paper; default: small")
     _add_data(commands)
     _add_zoo(commands)
+    _add_hidden(commands)
     _add(commands, "doctor", "Print versions, threads, GL, disk and GPU for a bug report", _doctor)
     return parser
 
@@ -141,6 +142,33 @@ def _add_zoo(commands: Any) -> None:
         command.add_argument("--quiet", action="store_true", help="no progress bars")
     for command in (listing, build):
         command.add_argument("--zoo", type=Path, metavar="DIR", help="policies of your own, from `envtf zoo train`")
+
+
+def _add_hidden(commands: Any) -> None:
+    hidden = _add(
+        commands,
+        "hidden",
+        "Measure what memory is worth where friction, mass and strength are hidden",
+        _hidden,
+    )
+    hidden.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON; the figure lies beside it")
+    robots = ["halfcheetah", "walker2d"]
+    choices = ["ant", "halfcheetah", "hopper", "walker2d"]
+    hidden.add_argument("--robots", nargs="+", default=robots, choices=choices, help="default: halfcheetah walker2d")
+    hidden.add_argument("--tier", default="medium-replay", help="of the data; default: medium-replay")
+    hidden.add_argument("--unseen", type=_natural, default=100_000, metavar="N", help="rows to measure on; 100,000")
+    _add_suite(hidden, context=32)
+
+
+def _add_suite(command: argparse.ArgumentParser, *, context: int) -> None:
+    """The options of a command that trains the suite of world models, unless they lie in its folder."""
+    command.add_argument("--work", type=Path, default=Path(".envtf/suite"), metavar="DIR", help="default: .envtf/suite")
+    command.add_argument("--transitions", type=_natural, default=100_000, metavar="N", help="rows of data; 100,000")
+    command.add_argument("--updates", type=_natural, default=6_000, metavar="N", help="of the transformers; 6,000")
+    command.add_argument("--context", type=_natural, default=context, metavar="N", help=f"steps; default: {context}")
+    command.add_argument("--seed", type=_natural, default=0, help="default: 0")
+    command.add_argument("--threads", type=_natural, default=os.cpu_count() or 1, help="default: one per core")
+    command.add_argument("--quiet", action="store_true", help="no progress bars")
 
 
 class _LazyHelp(argparse.ArgumentParser):
@@ -280,6 +308,31 @@ def _zoo_list(namespace: argparse.Namespace, rest: list[str]) -> None:
     for line in catalogue(namespace.zoo):
         table.add_row(*line)
     Console().print(table)
+
+
+def _hidden(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.hidden import compare
+
+    _hush_lightning()
+    compare(
+        namespace.out,
+        robots=namespace.robots,
+        tier=namespace.tier,
+        work=namespace.work,
+        options=_suite_options(namespace),
+        unseen=namespace.unseen,
+        progress=not namespace.quiet,
+        report=Console(highlight=False, markup=False, soft_wrap=True).print,
+    )
+
+
+def _suite_options(namespace: argparse.Namespace) -> Any:
+    from envtf_lit.suite import SuiteOptions
+
+    names = ("transitions", "updates", "context", "seed", "threads")
+    return SuiteOptions(**{name: getattr(namespace, name) for name in names})
 
 
 def _natural(text: str) -> int:

@@ -19,7 +19,7 @@ from envtf_lit import pipeline
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import load_dataset
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.params import DownloadOptions, EnsembleOptions, Params, Precision, TrainModelOptions
+from envtf_lit.params import DownloadOptions, EnsembleOptions, ModelOptions, Params, Precision, TrainModelOptions
 from envtf_lit.storage import read_json, write_json
 from envtf_lit.tasks import Robot, get_task
 from envtf_lit.validation import check_world_model
@@ -36,6 +36,7 @@ class SuiteOptions:
     Attributes:
         transitions: rows of the zoo's dataset.
         updates: gradient steps of the transformer and of its ablation, which sees as many steps per update.
+        context: of the transformer, steps.
         ensemble: the ensemble and its budget; it stops early.
         seed: of data and training.
         threads: CPU threads.
@@ -44,6 +45,7 @@ class SuiteOptions:
 
     transitions: int = 100_000
     updates: int = 6_000
+    context: int = ModelOptions().context
     ensemble: EnsembleOptions = field(default_factory=EnsembleOptions)
     seed: int = 0
     threads: int = 2
@@ -117,9 +119,10 @@ def _common(options: SuiteOptions) -> dict[str, Any]:
 def _params(name: str, task: str, options: SuiteOptions) -> Params:
     """The parameters that train one of `MODELS`."""
     train = TrainModelOptions(updates=options.updates, updates_per_epoch=min(1_000, options.updates))
+    train = replace(train, model=replace(train.model, context=options.context))
     if name == "context_1":  # windows of one step, as many steps per update
         model = replace(train.model, context=1)
-        train = replace(train, model=model, batch_size=train.batch_size * train.model.context)
+        train = replace(train, model=model, batch_size=train.batch_size * options.context)
     elif name == "ensemble":
         train = replace(train, ensemble=options.ensemble)
     params = replace(Params(), task=task, train_model=train, **_common(options))

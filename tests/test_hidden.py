@@ -1,0 +1,55 @@
+"""`envtf hidden` from end to end: data of hidden robots, three models, errors on draws that none has seen."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from envtf_lit import hidden
+from envtf_lit.errors import UserError
+from envtf_lit.params import EnsembleOptions
+from envtf_lit.suite import MODELS, SuiteOptions
+
+ENSEMBLE = EnsembleOptions(
+    members=2, elites=1, hidden=(8,), weight_decay=(0.0, 0.0), updates=2, updates_per_epoch=2, batch_size=8
+)
+TINY = SuiteOptions(transitions=1_000, updates=2, context=20, ensemble=ENSEMBLE, threads=1)
+
+
+def test_models_are_measured_on_draws_that_none_has_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hidden, "STRETCHES", 20)
+    lines = list[str]()
+    facts: dict[str, Any] = dict(tier="medium", work=tmp_path, options=TINY, unseen=1_000, progress=False)
+    metrics = hidden.compare(tmp_path / "out/hidden.json", robots=["hopper"], report=lines.append, **facts)
+    assert json.loads((tmp_path / "out/hidden.json").read_text()) == metrics
+    for name in MODELS:
+        assert len(metrics[f"hopper.{name}.one_step_by_context"]) == 32
+        assert metrics[f"hopper.{name}.one_step"] == metrics[f"hopper.{name}.one_step_by_context"][16]
+        assert metrics[f"hopper.{name}.train_seconds"] > 0
+        assert any(line.startswith(f"hopper.{name}.open_loop: ") for line in lines)
+    assert metrics["hopper.transformer.one_step_vs_ensemble"] == pytest.approx(
+        metrics["hopper.transformer.one_step"] / metrics["hopper.ensemble.one_step"]
+    )
+    with Image.open(tmp_path / "out/hidden.png") as figure:
+        assert figure.size[0] > 800
+    assert len(pd.read_csv(tmp_path / "out/hidden.csv")) == 3 * (32 + 25)
+
+    data = tmp_path / "hopper-medium-hidden/data"
+    (unseen,) = data.glob("unseen-*.h5")
+    with h5py.File(data / "dataset.h5") as seen, h5py.File(unseen) as new:
+        starts = [np.asarray(file["observations"])[0] for file in (seen, new)]
+    assert not np.array_equal(*starts)
+    made = unseen.stat().st_mtime_ns
+    again = hidden.compare(tmp_path / "again.json", robots=["hopper"], report=lines.append, **facts)
+    assert again == metrics and unseen.stat().st_mtime_ns == made
+
+
+def test_unknown_names_are_refused_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="halfcheetah-meduim-hidden"):
+        hidden.compare(tmp_path / "hidden.json", tier="meduim", work=tmp_path, options=TINY)
+    assert list(tmp_path.iterdir()) == []
