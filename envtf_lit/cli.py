@@ -95,15 +95,15 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_data(commands: Any) -> None:
-    summary = "Check a dataset file, or convert it to another format"
+    summary = "Check a dataset, or convert it to another format"
     data = commands.add_parser("data", help=summary, description=f"{summary}.")
     verbs = data.add_subparsers(dest="verb", required=True, metavar="VERB")
-    check = _add(verbs, "check", "Print what a dataset file holds and every problem in it, each with a fix", _check)
-    check.add_argument("file", help="HDF5 or NPZ")
+    check = _add(verbs, "check", "Print what a dataset holds and every problem in it, each with a fix", _check)
+    check.add_argument("source", metavar="IN", help="HDF5 or NPZ file, minari:ID, or a Minari dataset's folder")
     convert = _add(
         verbs, "convert", "Write a dataset in another format, and say what was changed or left behind", _convert
     )
-    convert.add_argument("source", metavar="IN", help="HDF5 or NPZ file, or minari:ID")
+    convert.add_argument("source", metavar="IN", help="the same")
     convert.add_argument("target", metavar="OUT", help="a new file ending in .h5, .hdf5 or .npz, or minari:ID")
     for command in (check, convert):
         command.add_argument("--task", help="robot and tier that the data came from, such as hopper-medium")
@@ -278,9 +278,9 @@ def _doctor(namespace: argparse.Namespace, rest: list[str]) -> None:
 def _check(namespace: argparse.Namespace, rest: list[str]) -> None:
     from rich.console import Console
 
-    from envtf_lit.data.inspection import inspect_file, render
+    from envtf_lit.data.inspection import inspect_source, render
 
-    inspection = inspect_file(namespace.file, task=namespace.task)
+    inspection = inspect_source(namespace.source, task=namespace.task)
     Console().print(render(inspection), soft_wrap=True)
     if not inspection.usable:
         raise SystemExit(2)

@@ -15,7 +15,7 @@ from envtf_lit.config import preset_params
 from envtf_lit.data.columns import FileRows, column_blocks, moments
 from envtf_lit.data.dataset import COLUMNS
 from envtf_lit.data.formats import load_dataset, save_dataset
-from envtf_lit.data.inspection import inspect_file
+from envtf_lit.data.inspection import inspect_source
 from envtf_lit.data.loaders import Store, Transitions, Windows
 from envtf_lit.errors import UserError
 from envtf_lit.imagination import BranchPoints
@@ -131,9 +131,9 @@ def test_shifted_successors_are_read_in_place(tmp_path: Path, in_file: pytest.Mo
 
 def test_the_check_of_a_large_file_says_the_same(tmp_path: Path, in_file: pytest.MonkeyPatch):
     save_dataset(walker_dataset(), tmp_path / "log.h5")
-    large = inspect_file(tmp_path / "log.h5")
+    large = inspect_source(tmp_path / "log.h5")
     in_file.undo()
-    assert inspect_file(tmp_path / "log.h5").findings == large.findings
+    assert inspect_source(tmp_path / "log.h5").findings == large.findings
 
 
 def test_branch_points_are_the_same(tmp_path: Path, in_file: pytest.MonkeyPatch):

@@ -13,7 +13,8 @@ from walker import walker_dataset
 from envtf_lit.cli import main
 from envtf_lit.data.conversion import convert
 from envtf_lit.data.formats import load_dataset, save_dataset
-from envtf_lit.data.inspection import inspect_file, quality, render
+from envtf_lit.data.inspection import inspect_source, quality, render
+from envtf_lit.data.minari_sets import write_minari
 from envtf_lit.errors import UserError
 
 
@@ -98,7 +99,7 @@ def test_the_report_shows_facts_and_problems_together(tmp_path: Path):
     content = columns() | {"metadata": np.zeros(3)}
     content["observations"][5, 2] = np.nan
     content["actions"] = content["actions"][:-1]
-    inspection = inspect_file(write(tmp_path / "bad.npz", content))
+    inspection = inspect_source(write(tmp_path / "bad.npz", content))
     shown = io.StringIO()
     Console(file=shown, width=160).print(render(inspection))
     text = shown.getvalue()
@@ -124,6 +125,41 @@ def test_check_prints_and_exits_by_what_it_finds(tmp_path: Path, capsys: pytest.
             main(["data", "check", str(tmp_path / arguments[0]), *arguments[1:]])
         assert stop.value.code == 2
         assert "not usable: " in capsys.readouterr().out
+
+
+def test_minari_datasets_are_checked_by_id_and_by_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    write_minari(walker_dataset(episodes=4), "my/walker-v0")
+    for source in ("minari:my/walker-v0", str(tmp_path / "my/walker-v0")):
+        main(["data", "check", source])
+        text = capsys.readouterr().out
+        assert "80 transitions in 4 episodes of 20 to 20 steps" in text
+        assert "warning: there are 4 episodes" in text
+    with h5py.File(tmp_path / "my/walker-v0/data/main_data.hdf5", "a") as file:
+        for column, row in (("rewards", 3), ("observations", 5)):
+            file[f"episode_1/{column}"][row] = np.nan  # pyright: ignore[reportIndexIssue]
+    found = [finding.what for finding in inspect_source("minari:my/walker-v0").findings if finding.kind == "error"]
+    assert [what.split(" has NaN")[0] for what in found] == ["'observations'", "'rewards'", "'next_observations'"]
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("minari:my/none-v0", "no Minari dataset my/none-v0"),
+        (".", "holds no Minari dataset"),
+        ("minari:x", "not a Minari"),
+    ],
+)
+def test_what_is_no_minari_dataset_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, message: str):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    inspection = inspect_source(source)
+    assert not inspection.usable
+    assert message in inspection.findings[0].what
+    with pytest.raises(UserError, match=message):
+        convert(source, str(tmp_path / "out.h5"))
 
 
 # convert

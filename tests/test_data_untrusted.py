@@ -17,7 +17,7 @@ from rich.console import Console
 
 from envtf_lit.data.dataset import COLUMNS
 from envtf_lit.data.formats import load_dataset
-from envtf_lit.data.inspection import inspect_file, render
+from envtf_lit.data.inspection import inspect_source, render
 from envtf_lit.errors import UserError
 
 
@@ -216,7 +216,7 @@ def check_ends_in_a_report(path: Path, data: st.DataObject) -> None:
 
 
 def check_report_and_loading(path: Path) -> None:
-    inspection = inspect_file(path)
+    inspection = inspect_source(path)
     shown = io.StringIO()
     Console(file=shown).print(render(inspection))
     assert ("not usable" in shown.getvalue()) == (not inspection.usable)

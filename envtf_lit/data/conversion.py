@@ -3,12 +3,10 @@
 from pathlib import Path
 
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.formats import is_hdf5, open_raw, save_dataset
-from envtf_lit.data.minari_sets import read_minari, write_minari
+from envtf_lit.data.formats import is_hdf5, save_dataset
+from envtf_lit.data.minari_sets import MINARI, open_source, write_minari
 from envtf_lit.data.validation import Finding, examine
 from envtf_lit.errors import UserError
-
-MINARI = "minari:"
 
 
 def convert(source: str, target: str, *, task: str | None = None) -> tuple[OfflineDataset, list[Finding]]:
@@ -18,7 +16,7 @@ def convert(source: str, target: str, *, task: str | None = None) -> tuple[Offli
     next observation differs from the following row's, `write_minari` splits the episode.
 
     Args:
-        source: an HDF5 or NPZ file, or `minari:` and the id of a Minari dataset on this machine.
+        source: an HDF5 or NPZ file, `minari:` and the id of a Minari dataset on this machine, or its folder.
         target: a new file ending in .h5, .hdf5 or .npz, or `minari:` and a new id, such as `minari:my/robot-v0`.
         task: such as `hopper-medium-replay`; None takes the name in the source, where there is one.
 
@@ -47,9 +45,7 @@ def convert(source: str, target: str, *, task: str | None = None) -> tuple[Offli
 
 
 def _read(source: str, task: str | None) -> tuple[OfflineDataset, list[Finding]]:
-    if source.startswith(MINARI):
-        return read_minari(source.removeprefix(MINARI), task=task), []
-    with open_raw(source) as raw:
+    with open_source(source) as raw:
         dataset, findings = examine(raw.columns, raw.attributes, task=task, broken=raw.broken)
     if dataset is None:
         worst = next(finding for finding in findings if finding.kind == "error")

@@ -1,4 +1,4 @@
-"""What `envtf data check` finds in a file: all of its facts and all of its problems at once, never a traceback."""
+"""What `envtf data check` finds in a dataset: all of its facts and all of its problems at once, never a traceback."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from rich.text import Text
 
 from envtf_lit.data.columns import blocks, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.formats import open_raw
+from envtf_lit.data.minari_sets import open_source
 from envtf_lit.data.validation import Finding, examine
 from envtf_lit.errors import UserError
 from envtf_lit.tasks import get_task
@@ -38,12 +38,12 @@ class Column:
 
 @dataclass
 class Inspection:
-    """Everything found in a file.
+    """Everything found in a dataset.
 
     Attributes:
-        source: the file.
+        source: the file, or what names a Minari dataset.
         columns: those that a dataset has.
-        ignored: names of what else is in the file.
+        ignored: names of what else is there.
         findings: the gravest first.
         dataset: None where there are errors.
     """
@@ -60,21 +60,21 @@ class Inspection:
         return all(finding.kind != "error" for finding in self.findings)
 
 
-def inspect_file(path: str | Path, *, task: str | None = None) -> Inspection:
-    """Looks at all that is in a dataset file.
+def inspect_source(source: str | Path, *, task: str | None = None) -> Inspection:
+    """Looks at all that is in a dataset.
 
     Args:
-        path: an HDF5 (.h5, .hdf5) or NPZ file.
-        task: such as `hopper-medium-replay`; None takes the name in the file, where there is one.
+        source: an HDF5 (.h5, .hdf5) or NPZ file, `minari:` and the id of a Minari dataset, or such a dataset's folder.
+        task: such as `hopper-medium-replay`; None takes the name in the source, where there is one.
 
     Raises:
-        UserError: `task` is none of ours. Whatever is wrong with the file is among the findings.
+        UserError: `task` is none of ours. Whatever is wrong with the source is among the findings.
     """
-    result = Inspection(str(path))
+    result = Inspection(str(source))
     if task is not None:
         get_task(task)
     try:
-        with open_raw(path) as raw:
+        with open_source(source) as raw:
             result.columns = [_describe(name, values) for name, values in raw.columns.items()]
             result.ignored = raw.ignored
             result.dataset, result.findings = examine(raw.columns, raw.attributes, task=task, broken=raw.broken)
@@ -224,7 +224,7 @@ def render(inspection: Inspection) -> RenderableType:
     """The report, for a rich console."""
     parts: list[RenderableType] = [Text(inspection.source, "bold"), _columns_table(inspection)]
     if inspection.ignored:
-        parts.append(Text(f"also in the file, not read: {', '.join(map(str, inspection.ignored[:8]))}"[:400]))
+        parts.append(Text(f"also there, not read: {', '.join(map(str, inspection.ignored[:8]))}"[:400]))
     if inspection.dataset is not None:
         parts += [_facts(inspection.dataset), _histogram(inspection.dataset.episode_returns)]
     for finding in inspection.findings:

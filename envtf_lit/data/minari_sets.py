@@ -18,7 +18,7 @@ import numpy as np
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.fetch import fingerprint
-from envtf_lit.data.formats import check_size, hdf5_bytes, own_hdf5
+from envtf_lit.data.formats import Raw, check_size, hdf5_bytes, open_raw, own_hdf5
 from envtf_lit.data.validation import build_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.hidden_dynamics import HiddenDynamics
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from minari import EpisodeData, MinariDataset
 
 HDF5_FILE = "main_data.hdf5"  # the whole of a Minari dataset in the format `hdf5`, its default
+MINARI = "minari:"  # before an id, where a file could stand
 TASK = "envtf_lit_task"  # our key in Minari's metadata
 FACTS = ("total_episodes", "total_steps", "minari_version", "algorithm_name", "author", "code_permalink")
 
@@ -49,15 +50,36 @@ def read_minari(id_or_path: str | Path, *, task: str | None = None, download: bo
         UserError: there is no such dataset or it cannot be fetched, its observations or actions are not plain vectors,
             or it is damaged or does not fit the task.
     """
+    raw = _raw(id_or_path, download)
+    return build_dataset(raw.columns, raw.attributes, task=task, source=f"The Minari dataset {id_or_path}")
+
+
+def open_source(source: str | Path) -> contextlib.AbstractContextManager[Raw]:
+    """What any dataset on this machine holds, as it lies there; its columns may be used inside the block alone.
+
+    Args:
+        source: an HDF5 or NPZ file, `minari:` and the id of a Minari dataset, or such a dataset's folder.
+
+    Raises:
+        UserError: there is nothing of that name, or it is none of these, damaged, or made to do harm.
+    """
+    name = str(source)
+    if name.startswith(MINARI):
+        return contextlib.nullcontext(_raw(name.removeprefix(MINARI), download=False))
+    if Path(source).is_dir():
+        return contextlib.nullcontext(_raw(source, download=False))
+    return open_raw(source)
+
+
+def _raw(id_or_path: str | Path, download: bool) -> Raw:
     folder = _find(id_or_path, download)
     source = f"The Minari dataset {id_or_path}"
     with _explained(source):
         dataset = _open(folder, source)
         _check_spaces(dataset, source)
-        columns = _columns(dataset, source)
         attributes = {"action_low": dataset.action_space.low, "action_high": dataset.action_space.high}
         attributes["task"] = dataset.storage.metadata.get(TASK)
-    return build_dataset(columns, attributes, task=task, source=source)
+        return Raw(_columns(dataset, source), attributes)
 
 
 def describe_minari(id_or_path: str | Path) -> dict[str, Any]:
@@ -123,7 +145,10 @@ def _find(id_or_path: str | Path, download: bool) -> Path:
     """The folder with `metadata.json`."""
     given = Path(id_or_path)
     if given.is_dir():
-        return given / "data" if (given / "data").is_dir() else given
+        folder = given / "data" if (given / "data").is_dir() else given
+        if not (folder / "metadata.json").is_file():
+            raise UserError(f"{given} is a folder and holds no Minari dataset: name a dataset's folder, or a file.")
+        return folder
     if given.is_absolute():
         raise UserError(f"{given} is not a folder: give the folder of a Minari dataset, or its id.")
     folder = _place(str(id_or_path), None) / "data"
