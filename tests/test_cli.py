@@ -6,15 +6,18 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pytest
 
+from envtf_lit import pipeline
+from envtf_lit.behaviour_training import RECIPES
 from envtf_lit.cli import LIGHTNING, STAGES, flags_to_overrides, main
 from envtf_lit.config import dump_params, load_params, params_yaml, preset_params
 from envtf_lit.data.formats import load_dataset
 from envtf_lit.errors import UserError
+from envtf_lit.tasks import ROBOTS
 
 COMMANDS = [*STAGES, "init", "params", "doctor"]
 
@@ -51,6 +54,23 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(["--help"]) == 0
     text = capsys.readouterr().out
     assert [command for command in [*COMMANDS, *LIGHTNING, "data", "zoo"] if f"\n    {command}" not in text] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "known"),
+    [
+        (["train_policy", "?"], pipeline.ALGORITHMS),
+        (["zoo", "train", "--robot", "?"], ROBOTS),
+        (["zoo", "train", "--algorithm", "?"], RECIPES),
+    ],
+)
+def test_names_that_the_command_line_writes_out_itself_are_all_there_are(
+    arguments: list[str], known: Iterable[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It would take a second to import what knows them."""
+    assert exit_status(arguments) == 2
+    named = capsys.readouterr().err.partition("choose from")[2]
+    assert sorted(re.findall(r"\w+", named)) == sorted(known)
 
 
 def test_help_is_quick() -> None:
