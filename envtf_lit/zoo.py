@@ -74,12 +74,13 @@ def build(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{out} cannot hold datasets ({error.strerror}): choose another folder.") from None
-    for task in wanted:
+    for number, task in enumerate(wanted, start=1):
         if _is_made(task, out, describe_origin(task, transitions, seed, zoo)):
-            report(f"{task.name}: is there")
-            continue
-        entry = _make(task, out, transitions=transitions, seed=seed, workers=workers, zoo=zoo, progress=progress)
-        report(f"{task.name}: mean score {entry.mean_score:.1f}, {entry.seconds:.0f} s")
+            outcome = "is there"
+        else:
+            entry = _make(task, out, transitions=transitions, seed=seed, workers=workers, zoo=zoo, progress=progress)
+            outcome = f"mean score {entry.mean_score:.1f}, {entry.seconds:.0f} s"
+        report(f"{number} of {len(wanted)}, {task.name}: {outcome}")
     entries = [_entry(card) for card in _cards(out)]
     write_json(out / INDEX, [asdict(entry) for entry in entries])
     _write_text(out / Path(INDEX).with_suffix(".md"), index_page(entries))

@@ -77,6 +77,16 @@ def test_what_is_there_is_left_alone_and_what_was_asked_otherwise_is_made_anew(o
     build_again(out, ["hopper-medium"])
 
 
+def test_each_dataset_is_reported_with_its_place_in_the_queue(out: Path) -> None:
+    said: list[str] = []
+    names = ["hopper-medium", "hopper-medium-v4"]
+    build(names, out, transitions=300, seed=0, workers=1, progress=False, report=said.append)
+    assert said[0] == "1 of 2, hopper-medium: is there"
+    assert said[1].startswith("2 of 2, hopper-medium-v4: mean score ")
+    for path in out.glob("hopper-medium-v4.*"):
+        path.unlink()
+
+
 def test_a_dataset_without_its_card_is_unfinished(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As after an interrupt between the two: the next call makes it again."""
 
