@@ -50,3 +50,24 @@ def assert_equal(first: OfflineDataset, second: OfflineDataset) -> None:
         assert one.dtype == two.dtype, name
         assert np.array_equal(one, two), name
     assert first.task == second.task
+
+
+def dataset_of_chains(task: str | None = None, width: int = 4, actions: int = 2) -> OfflineDataset:
+    """Episodes of 3, 2 and 4 steps: terminated, truncated, and one that the log cuts."""
+    rng = np.random.default_rng(0)
+    lengths = (3, 2, 4)
+    chains = [rng.normal(size=(length + 1, width)).astype(np.float32) for length in lengths]
+    terminated, truncated = np.zeros(9, bool), np.zeros(9, bool)
+    terminated[2] = truncated[4] = truncated[8] = True
+    return OfflineDataset(
+        observations=np.concatenate([chain[:-1] for chain in chains]),
+        actions=rng.uniform(-1, 1, (9, actions)).astype(np.float32),
+        rewards=rng.normal(size=9).astype(np.float32),
+        next_observations=np.concatenate([chain[1:] for chain in chains]),
+        terminated=terminated,
+        truncated=truncated,
+        episode_starts=np.array([0, 3, 5]),
+        action_low=np.full(actions, -1, np.float32),
+        action_high=np.full(actions, 1, np.float32),
+        task=task,
+    )

@@ -127,17 +127,14 @@ def test_check_prints_and_exits_by_what_it_finds(tmp_path: Path, capsys: pytest.
         assert "not usable: " in capsys.readouterr().out
 
 
-def test_minari_datasets_are_checked_by_id_and_by_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+def test_minari_datasets_are_checked_by_id_and_by_folder(minari_root: Path, capsys: pytest.CaptureFixture[str]):
     write_minari(walker_dataset(episodes=4), "my/walker-v0")
-    for source in ("minari:my/walker-v0", str(tmp_path / "my/walker-v0")):
+    for source in ("minari:my/walker-v0", str(minari_root / "my/walker-v0")):
         main(["data", "check", source])
         text = capsys.readouterr().out
         assert "80 transitions in 4 episodes of 20 to 20 steps" in text
         assert "warning: there are 4 episodes" in text
-    with h5py.File(tmp_path / "my/walker-v0/data/main_data.hdf5", "a") as file:
+    with h5py.File(minari_root / "my/walker-v0/data/main_data.hdf5", "a") as file:
         for column, row in (("rewards", 3), ("observations", 5)):
             file[f"episode_1/{column}"][row] = np.nan  # pyright: ignore[reportIndexIssue]
     found = [finding.what for finding in inspect_source("minari:my/walker-v0").findings if finding.kind == "error"]
@@ -152,8 +149,8 @@ def test_minari_datasets_are_checked_by_id_and_by_folder(
         ("minari:x", "not a Minari"),
     ],
 )
+@pytest.mark.usefixtures("minari_root")
 def test_what_is_no_minari_dataset_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, message: str):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     inspection = inspect_source(source)
     assert not inspection.usable
@@ -175,16 +172,16 @@ def test_convert_there_and_back_is_lossless(tmp_path: Path, first: str, second: 
     assert_equal(load_dataset(tmp_path / f"b{second}"), walker_dataset())
 
 
-def test_convert_to_minari_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+@pytest.mark.usefixtures("minari_root")
+def test_convert_to_minari_and_back(tmp_path: Path):
     save_dataset(walker_dataset(), tmp_path / "in.h5")
     assert convert(str(tmp_path / "in.h5"), "minari:my/walker-v0")[1] == []
     convert("minari:my/walker-v0", str(tmp_path / "out.h5"))
     assert (tmp_path / "out.h5").read_bytes() == (tmp_path / "in.h5").read_bytes()
 
 
-def test_convert_counts_the_episodes_that_minari_cannot_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+@pytest.mark.usefixtures("minari_root")
+def test_convert_counts_the_episodes_that_minari_cannot_hold(tmp_path: Path):
     dataset, findings = convert(str(write(tmp_path / "in.h5", columns())), "minari:noise-v0")
     said = "; ".join(map(str, findings))
     assert "9 episodes were split" in said

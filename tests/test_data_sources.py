@@ -49,8 +49,8 @@ def test_file(dataset: OfflineDataset, tmp_path: Path):
     assert "policies" not in dataset_card(read, "file", origin)
 
 
-def test_minari(dataset: OfflineDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+@pytest.mark.usefixtures("minari_root")
+def test_minari(dataset: OfflineDataset):
     write_minari(dataset, "ours/hopper-v0")
     options = DownloadOptions(source="minari", minari_id="ours/hopper-v0")
     read, origin = make_dataset(TASK, options, seed=0, workers=1)
