@@ -140,6 +140,35 @@ class GenerateRolloutsOptions:
 
 
 @dataclass(frozen=True)
+class ValueGradientOptions:
+    """The last updates of a policy that imagines: its actor follows the gradient of imagined returns (SHAC, Xu 2022).
+
+    Attributes:
+        updates: of all the policy's updates, the last so many; each is one of the actor.
+        rollouts: imagined at a time; each is carried on from update to update until the robot falls.
+        horizon: steps of each rollout per update, after which a learned state value stands for what follows.
+        max_steps: after which a rollout begins anew at a real state.
+        trace: lambda of the state value's TD(lambda) targets.
+        value_passes: of the state value over the steps of each update.
+        value_learning_rate: Adam's.
+        learning_rate: Adam's, of the actor; reached after a tenth of these updates, from there linearly to zero.
+        clone_weight: weight in the actor's objective of cloning the real rows' actions.
+        actor_average: share of the actor that enters the averaged actor at each of these updates.
+    """
+
+    updates: int = 400
+    rollouts: int = 64
+    horizon: int = 16
+    max_steps: int = 1_000
+    trace: float = 0.95
+    value_passes: int = 4
+    value_learning_rate: float = 0.001
+    learning_rate: float = 0.001
+    clone_weight: float = 0.05
+    actor_average: float = 0.05
+
+
+@dataclass(frozen=True)
 class ImaginationOptions:
     """How imagined transitions enter policy learning.
 
@@ -165,6 +194,8 @@ class ImaginationOptions:
         selection_episodes: imagined episodes that judge the averaged actor after each epoch, from recorded first
             states; the actor of highest imagined return is kept. 0 keeps the last.
         selection_steps: of each such episode at most.
+        value_gradient: the end of the training, in which the actor follows the gradient through the world model; null
+            leaves all updates to CQL.
     """
 
     real_ratio: float = 0.75
@@ -182,6 +213,7 @@ class ImaginationOptions:
     penalty_up_on: Literal["real", "mixture"] = "real"
     selection_episodes: int = 0
     selection_steps: int = 1_000
+    value_gradient: ValueGradientOptions | None = field(default_factory=ValueGradientOptions)
 
 
 @dataclass(frozen=True)
@@ -224,7 +256,7 @@ class PolicyOptions:
     hidden: tuple[int, ...] = (256, 256)
     critics: int = 2
     layer_norm: bool = True
-    discount: float = 0.99
+    discount: float = 0.997
     normalise_returns: bool = True
     return_temperature: float | None = 0.1
     n_step: int = 20

@@ -8,7 +8,15 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.params import DownloadOptions, EnsembleOptions, ModelOptions, Params, PolicyOptions, TrainModelOptions
+from envtf_lit.params import (
+    DownloadOptions,
+    EnsembleOptions,
+    ImaginationOptions,
+    ModelOptions,
+    Params,
+    PolicyOptions,
+    TrainModelOptions,
+)
 
 
 class Range(NamedTuple):
@@ -32,12 +40,13 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("updates_per_step", "batch_size", "clone_updates", "clone_batch_size", "branches"), _COUNT),
     **dict.fromkeys(("horizon", "buffer_size", "hidden", "critics", "sampled_actions", "episodes"), _COUNT),
     **dict.fromkeys(("trajectories", "n_step", "selection_steps", "members", "elites", "patience"), _COUNT),
+    **dict.fromkeys(("rollouts", "max_steps", "value_passes"), _COUNT),
     **dict.fromkeys(
         ("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty", "tail", "posterior"),
         _NOT_NEGATIVE,
     ),
     **dict.fromkeys(("cql_weight", "clone_weight", "warm_start", "selection_episodes"), _NOT_NEGATIVE),
-    **dict.fromkeys(("learning_rate", "actor_learning_rate", "critic_learning_rate"), _POSITIVE),
+    **dict.fromkeys(("learning_rate", "actor_learning_rate", "critic_learning_rate", "value_learning_rate"), _POSITIVE),
     **dict.fromkeys(
         (
             "warm_start_learning_rate",
@@ -50,7 +59,7 @@ RANGES: dict[str, Range] = {
         ),
         _POSITIVE,
     ),
-    **dict.fromkeys(("dropout", "warmup", "discount"), _SHARE),
+    **dict.fromkeys(("dropout", "warmup", "discount", "trace"), _SHARE),
     "held_out": _INNER_SHARE,
     **dict.fromkeys(("real_ratio", "target_rate", "actor_average"), _NONZERO_SHARE),
     "transitions": Range(lambda value: value >= 1000, "1000 or more"),
@@ -224,8 +233,24 @@ def _check_policies(params: Params) -> None:
                 f"train_policy.{name}.warm_start is {options.warm_start}, more than its updates ({options.updates}): "
                 "the warm start is a part of them."
             )
-    history = policies.et_cql.imagination.history
-    _check_history("train_policy.et_cql.imagination", history, params.train_model.model)
+    _check_imagination(policies.et_cql, policies.et_cql.imagination, params.train_model.model)
+
+
+def _check_imagination(policy: PolicyOptions, imagination: ImaginationOptions, model: ModelOptions) -> None:
+    section, climbing = "train_policy.et_cql.imagination", imagination.value_gradient
+    _check_history(section, imagination.history, model)
+    if climbing is None:
+        return
+    if climbing.horizon < imagination.history:
+        raise UserError(
+            f"{section}.value_gradient.horizon is {climbing.horizon} and history is {imagination.history}: rollouts "
+            "carried on take their history from the steps before, so take a horizon of at least that."
+        )
+    if climbing.updates > policy.updates - policy.warm_start:
+        raise UserError(
+            f"{section}.value_gradient.updates is {climbing.updates}, and {policy.updates - policy.warm_start} updates "
+            "come after the warm start: take no more than those."
+        )
 
 
 def _check_epistemic(params: Params) -> None:

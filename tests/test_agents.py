@@ -192,7 +192,7 @@ def test_mixing_keeps_the_real_ratio_and_charges_for_uncertainty():
     assert mixed["real"].tolist() == [1.0] * 6 + [0.0] * 2
     assert torch.equal(mixed["rewards"][:6], batch["rewards"][:6])
     assert mixed["rewards"][6:].tolist() == [1.0 - 2.0 * 3.0 * 0.5] * 2
-    torch.testing.assert_close(mixed["discounts"][6:], torch.full((2,), 0.99))
+    torch.testing.assert_close(mixed["discounts"][6:], torch.full((2,), agent.options.discount))
 
 
 def test_steps_of_the_tail_enter_targets_but_not_the_ring():

@@ -16,7 +16,7 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import load_dataset, save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.offline import action_error, imagined_returns, judge
-from envtf_lit.params import DownloadOptions, ImaginationOptions, Params
+from envtf_lit.params import DownloadOptions, ImaginationOptions, Params, ValueGradientOptions
 from envtf_lit.validation import check_rules
 from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
 
@@ -107,7 +107,10 @@ def own_log(episodes: int = 12, length: int = 25) -> OfflineDataset:
 
 def own_params(path: Path) -> Params:
     tiny = preset_params("tiny")
-    imagination = ImaginationOptions(refresh_every=20, branches=20, horizon=2, tail=2, history=2, buffer_size=200)
+    climbing = ValueGradientOptions(updates=5, rollouts=5, horizon=3)
+    imagination = ImaginationOptions(
+        refresh_every=20, branches=20, horizon=2, tail=2, history=2, buffer_size=200, value_gradient=climbing
+    )
     policy = replace(tiny.train_policy.et_cql, updates=40, updates_per_epoch=20, imagination=imagination)
     return replace(
         tiny,

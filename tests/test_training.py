@@ -14,7 +14,14 @@ from lightning.pytorch.callbacks import Callback
 from envtf_lit import pipeline
 from envtf_lit.config import params_yaml, preset_params
 from envtf_lit.data.formats import save_dataset
-from envtf_lit.params import ImaginationOptions, ModelOptions, Params, PolicyOptions, TrainModelOptions
+from envtf_lit.params import (
+    ImaginationOptions,
+    ModelOptions,
+    Params,
+    PolicyOptions,
+    TrainModelOptions,
+    ValueGradientOptions,
+)
 from envtf_lit.storage import load_weights
 from envtf_lit.training import run_folder
 from envtf_lit.world_models.horizon import Scale, open_loop_error, segments
@@ -40,7 +47,14 @@ POLICY = PolicyOptions(
     batch_size=16,
     hidden=(16, 16),
     warm_start=4,
-    imagination=ImaginationOptions(refresh_every=2, branches=20, horizon=2, history=2, buffer_size=100),
+    imagination=ImaginationOptions(
+        refresh_every=2,
+        branches=20,
+        horizon=2,
+        history=2,
+        buffer_size=100,
+        value_gradient=ValueGradientOptions(updates=6, rollouts=5, horizon=3),
+    ),
 )
 TINY = replace(
     TINY,

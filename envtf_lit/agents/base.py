@@ -12,20 +12,23 @@ from torch import Tensor, nn
 
 from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.ring import ImaginedRing
+from envtf_lit.agents.value_gradient import ValueGradient
 from envtf_lit.data.loaders import TransitionData, epoch_generator
 from envtf_lit.imagination import Imagination, Rollouts
-from envtf_lit.params import ImaginationOptions, PolicyOptions
+from envtf_lit.params import ImaginationOptions, PolicyOptions, ValueGradientOptions
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.storage import load_weights
 
 Batch = dict[str, Tensor]
+TARGET_VALUE_RATE = 0.3  # share of the state value that enters its target at each update of the actor through the model
 
 
 class OfflineAgent(L.LightningModule, ABC):
     """Actor, critics and their targets, updated several times per training step (manual optimisation).
 
     A batch holds (K, B, …) transitions for K gradient steps; there is no host synchronisation between them. With
-    imagination, `1 - real_ratio` of each B rows is replaced by rows of the imagined ring.
+    imagination, `1 - real_ratio` of each B rows is replaced by rows of the imagined ring, and in the last updates the
+    actor follows the gradient of imagined returns (`ValueGradient`).
 
     Logged names are explained in docs/metrics.md.
 
@@ -79,8 +82,11 @@ class OfflineAgent(L.LightningModule, ABC):
         self.average_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.log_alpha = nn.Parameter(torch.tensor(self.options.initial_alpha).log())
         self.ring: ImaginedRing | None = None
+        self.value_gradient: ValueGradient | None = None
         if self.options.imagination is not None:
             self.ring = ImaginedRing(observation_dim, action_dim, self.options.imagination.buffer_size)
+            if self.options.imagination.value_gradient is not None:
+                self.value_gradient = ValueGradient(observation_dim, self.options.imagination.value_gradient)
         self.imagination: Imagination | None = None
         self.first: Rollouts | None = None
         self.reward_std = 1.0
@@ -88,7 +94,10 @@ class OfflineAgent(L.LightningModule, ABC):
 
     def normalise_with(self, mean: Tensor, std: Tensor) -> None:
         """Sets the observation scale of every network."""
-        for network in (self.actor, self.average_actor, self.critics, self.target_critics):
+        networks: list[Any] = [self.actor, self.average_actor, self.critics, self.target_critics]
+        if self.value_gradient is not None:
+            networks += [self.value_gradient.value, self.value_gradient.target_value]
+        for network in networks:
             network.observation_mean.copy_(mean)
             network.observation_std.copy_(std)
 
@@ -116,6 +125,8 @@ class OfflineAgent(L.LightningModule, ABC):
         self.generator = epoch_generator(self.seed, self.current_epoch, "agent")
         self.update_index = self.current_epoch * self.options.updates_per_epoch
         self.logged: dict[str, list[Tensor]] = {}
+        if self.value_gradient is not None:  # each epoch depends on its own seed alone: a run can resume there
+            self.value_gradient.restart()
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
         for k in range(len(batch["rewards"])):
@@ -144,7 +155,16 @@ class OfflineAgent(L.LightningModule, ABC):
         actor = torch.optim.Adam(self.actor.parameters(), lr=o.actor_learning_rate)
         critics = torch.optim.Adam(self.critics.parameters(), lr=o.critic_learning_rate)
         alpha = torch.optim.Adam([self.log_alpha], lr=o.actor_learning_rate)
-        return [actor, critics, alpha]
+        if self.value_gradient is None:
+            return [actor, critics, alpha]
+        value, options = self.value_gradient.value, self.value_gradient.options
+        return [
+            actor,
+            critics,
+            alpha,
+            torch.optim.Adam(self.actor.parameters(), lr=options.learning_rate, betas=(0.7, 0.95)),  # SHAC's
+            torch.optim.Adam(value.parameters(), lr=options.value_learning_rate),
+        ]
 
     # One gradient step
 
@@ -153,8 +173,11 @@ class OfflineAgent(L.LightningModule, ABC):
         batch = batch | {name: batch[name] / self.return_scale for name in ("rewards", "returns")}
         if self.update_index < self.options.warm_start:
             return self.warm_up(batch)
+        gradient = self.value_gradient
+        if gradient is not None and self.update_index >= self.options.updates - gradient.options.updates:
+            return self.climb(batch, gradient)
         batch = self.mix(batch)
-        actor_optimizer, critic_optimizer, alpha_optimizer = self._optimizers()
+        actor_optimizer, critic_optimizer, alpha_optimizer, *_ = self._optimizers()
         critic_loss, logs = self.critic_loss(batch, self.generator)
         _descend(self, critic_optimizer, critic_loss)
         self.critics.requires_grad_(False)
@@ -167,16 +190,22 @@ class OfflineAgent(L.LightningModule, ABC):
 
     def warm_up(self, batch: Batch) -> dict[str, Tensor]:
         """Critics regress on Monte-Carlo returns of the log; the actor clones it, unless it began from `init_from`."""
-        actor_optimizer, critic_optimizer, _ = self._optimizers()
+        actor_optimizer, critic_optimizer, *_ = self._optimizers()
         q = self.critics(batch["observations"], batch["actions"])
         critic_loss = 0.5 * (q - batch["returns"]).square().mean(1).sum()
         _descend(self, critic_optimizer, critic_loss)
         clone_loss = self.clone_loss(batch | {"real": torch.ones_like(batch["rewards"])})
         if self.init_from is None:
             _descend(self, actor_optimizer, clone_loss)
+        if self.value_gradient is not None:
+            _descend(
+                self, self._optimizers()[4], self.value_gradient.value_loss(batch["observations"], batch["returns"])
+            )
         if self.update_index == self.options.warm_start - 1:
             self.target_critics.load_state_dict(self.critics.state_dict())
             self.average_actor.load_state_dict(self.actor.state_dict())
+            if self.value_gradient is not None:
+                self.value_gradient.target_value.load_state_dict(self.value_gradient.value.state_dict())
         return dict(warm_critic_loss=critic_loss, clone_loss=clone_loss, q_data=q.mean())
 
     def clone_loss(self, batch: Batch) -> Tensor:
@@ -184,10 +213,35 @@ class OfflineAgent(L.LightningModule, ABC):
         log_density = self.actor.log_prob(batch["observations"], batch["actions"])
         return -(batch["real"] * log_density).sum() / batch["real"].sum()
 
+    def climb(self, batch: Batch, gradient: ValueGradient) -> dict[str, Tensor]:
+        """One update of the actor along the gradient of imagined returns, kept near the real rows' actions.
+
+        It begins at the averaged actor. The state value then learns from the same paths.
+        """
+        assert self.imagination is not None
+        options, done = gradient.options, self.update_index - (self.options.updates - gradient.options.updates)
+        if done == 0:
+            self.actor.load_state_dict(self.average_actor.state_dict())
+        *_, actor_optimizer, value_optimizer = self._optimizers()
+        actor_optimizer.param_groups[0]["lr"] = options.learning_rate * gradient.rate(done / options.updates)
+        with torch.autocast(self.device.type, enabled=False):  # errors of bf16 would add up along the path
+            paths = gradient.paths(self.actor, self.imagination, self.return_scale, self.generator)
+            gradient.value.requires_grad_(False)
+            imagined = gradient.imagined_return(paths, self.options.discount).mean()
+            clone_loss = self.clone_loss(batch | {"real": torch.ones_like(batch["rewards"])})
+            _descend(self, actor_optimizer, options.clone_weight * clone_loss - imagined, clip=1.0)
+            gradient.value.requires_grad_(True)
+            for observations, targets in gradient.lessons(paths, self.options.discount, self.generator):
+                value_loss = gradient.value_loss(observations, targets)
+                _descend(self, value_optimizer, value_loss)
+        _follow(gradient.target_value, gradient.value, TARGET_VALUE_RATE)
+        _follow(self.average_actor, self.actor, options.actor_average)
+        return dict(imagined_value=imagined * self.return_scale, value_loss=value_loss, path_clone_loss=clone_loss)
+
     def _optimizers(self) -> list[Any]:
-        """The three optimisers, at the learning rates of the current update."""
+        """The optimisers; those of actor, critics and alpha at the learning rates of the current update."""
         optimizers: list[Any] = self.optimizers()  # pyright: ignore[reportAssignmentType]
-        for optimizer, rate in zip(optimizers, self._rates(), strict=True):
+        for optimizer, rate in zip(optimizers, self._rates(), strict=False):
             optimizer.param_groups[0]["lr"] = rate
         return optimizers
 
@@ -241,15 +295,10 @@ class OfflineAgent(L.LightningModule, ABC):
         every = imagination.refresh_every
         return every > 0 and (self.update_index - self.options.warm_start) % every == 0
 
-    @torch.no_grad()
     def follow(self) -> None:
         """Targets move towards the critics, the averaged actor towards the actor."""
-        for follower, leader, rate in (
-            (self.target_critics, self.critics, self.options.target_rate),
-            (self.average_actor, self.actor, self.options.actor_average),
-        ):
-            for slow, fast in zip(follower.parameters(), leader.parameters(), strict=True):
-                slow.lerp_(fast, rate)
+        _follow(self.target_critics, self.critics, self.options.target_rate)
+        _follow(self.average_actor, self.actor, self.options.actor_average)
 
     # What an algorithm defines: losses, and detached scalars to log
 
@@ -266,9 +315,17 @@ class OfflineAgent(L.LightningModule, ABC):
         """Of the actor's mean entropy, reaching `log_alpha` alone."""
 
 
-def _descend(module: L.LightningModule, optimizer: Any, loss: Tensor) -> None:
+@torch.no_grad()
+def _follow(follower: nn.Module, leader: nn.Module, rate: float) -> None:
+    for slow, fast in zip(follower.parameters(), leader.parameters(), strict=True):
+        slow.lerp_(fast, rate)
+
+
+def _descend(module: L.LightningModule, optimizer: Any, loss: Tensor, clip: float | None = None) -> None:
     optimizer.zero_grad(set_to_none=True)
     module.manual_backward(loss)
+    if clip is not None:
+        module.clip_gradients(optimizer, gradient_clip_val=clip, gradient_clip_algorithm="norm")
     optimizer.step()
 
 
@@ -280,5 +337,7 @@ def _policy_options(options: PolicyOptions | dict[str, Any] | None) -> PolicyOpt
         return options
     imagination = options.get("imagination")
     if isinstance(imagination, dict):
-        imagination = ImaginationOptions(**imagination)
+        climbing = imagination.get("value_gradient")
+        climbing = ValueGradientOptions(**climbing) if isinstance(climbing, dict) else climbing
+        imagination = ImaginationOptions(**{**imagination, "value_gradient": climbing})
     return PolicyOptions(**{**options, "hidden": tuple(options["hidden"]), "imagination": imagination})

@@ -1,4 +1,4 @@
-"""Q-functions, all members of a stack in one batched product."""
+"""Q-functions, all members of a stack in one batched product, and the value of states."""
 
 import math
 from collections.abc import Sequence
@@ -61,3 +61,25 @@ class StackedCritics(nn.Module):
         if self.layer_norm:  # without gain and shift, which the next layer can express
             x = F.layer_norm(x, x.shape[-1:])
         return F.relu(x)
+
+
+class StateValue(nn.Module):
+    """`V(s)`, an MLP with SiLU and LayerNorm (without gain and shift): smooth, since actors follow its gradient."""
+
+    observation_mean: Tensor
+    observation_std: Tensor
+
+    def __init__(self, observation_dim: int, *, hidden: Sequence[int]) -> None:
+        super().__init__()
+        sizes = [observation_dim, *hidden]
+        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+        self.out = nn.Linear(hidden[-1], 1)
+        self.register_buffer("observation_mean", torch.zeros(observation_dim))
+        self.register_buffer("observation_std", torch.ones(observation_dim))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Observations (..., S) to (...), fp32."""
+        x = (observation - self.observation_mean) / self.observation_std
+        for layer in self.hidden:
+            x = F.silu(F.layer_norm(layer(x), (layer.out_features,)))
+        return self.out(x).float()[..., 0]
