@@ -43,10 +43,15 @@ class Curves(Checkpoint):
     def __init__(self) -> None:
         self.rows: list[dict[str, float]] = []
 
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: object, batch_index: int
+    ) -> None:
+        if batch_index == 0:  # or what this epoch does not log would be repeated from the one before
+            trainer.callback_metrics.clear()
+
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         values = {name: float(value) for name, value in sorted(trainer.callback_metrics.items())}
         self.rows.append({"epoch": trainer.current_epoch + 1, **values})
-        trainer.callback_metrics.clear()  # or what a later epoch does not log would be repeated there
 
     def state_dict(self) -> dict[str, Any]:
         return {"rows": self.rows}
