@@ -81,5 +81,6 @@ class StateValue(nn.Module):
         """Observations (..., S) to (...), fp32."""
         x = (observation - self.observation_mean) / self.observation_std
         for layer in self.hidden:
-            x = F.silu(F.layer_norm(layer(x), (layer.out_features,)))
+            x = layer(x)
+            x = F.silu(F.layer_norm(x, x.shape[-1:]))
         return self.out(x).float()[..., 0]
