@@ -90,6 +90,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_data(commands)
     _add_zoo(commands)
     _add_hidden(commands)
+    _add_horizon(commands)
     _add(commands, "doctor", "Print versions, threads, GL, disk and GPU for a bug report", _doctor)
     return parser
 
@@ -158,6 +159,35 @@ def _add_hidden(commands: Any) -> None:
     hidden.add_argument("--tier", default="medium-replay", help="of the data; default: medium-replay")
     hidden.add_argument("--unseen", type=_natural, default=100_000, metavar="N", help="rows to measure on; 100,000")
     _add_suite(hidden, context=32)
+
+
+def _add_horizon(commands: Any) -> None:
+    horizon = _add(
+        commands,
+        "horizon",
+        "Measure how long world models track reality, beside the ceiling that physics sets",
+        _horizon,
+    )
+    horizon.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="JSON; a table and a folder of figures lie beside it"
+    )
+    robots = ["hopper", "halfcheetah", "walker2d", "ant"]
+    horizon.add_argument("--robots", nargs="+", default=robots, choices=robots, help="default: all four")
+    horizon.add_argument("--tier", default="medium-replay", help="of the data; default: medium-replay")
+    horizon.add_argument(
+        "--trajectories", type=_natural, default=300, metavar="N", help="fresh episodes with recorded actions; 300"
+    )
+    horizon.add_argument(
+        "--online", type=_natural, default=100, metavar="N", help="fresh episodes of each online policy; 100"
+    )
+    horizon.add_argument(
+        "--model",
+        action="append",
+        default=[],
+        metavar="NAME=FOLDER",
+        help="a further world model; {task} and {robot} in the folder stand for their names; may be repeated",
+    )
+    _add_suite(horizon, context=16)
 
 
 def _add_suite(command: argparse.ArgumentParser, *, context: int) -> None:
@@ -326,6 +356,32 @@ def _hidden(namespace: argparse.Namespace, rest: list[str]) -> None:
         progress=not namespace.quiet,
         report=Console(highlight=False, markup=False, soft_wrap=True).print,
     )
+
+
+def _horizon(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.horizon import HorizonOptions, compare
+
+    _hush_lightning()
+    compare(
+        namespace.out,
+        robots=namespace.robots,
+        tier=namespace.tier,
+        work=namespace.work,
+        options=_suite_options(namespace),
+        measured=HorizonOptions(namespace.trajectories, namespace.online),
+        others=dict(_named_folder(text) for text in namespace.model),
+        progress=not namespace.quiet,
+        report=Console(highlight=False, markup=False, soft_wrap=True).print,
+    )
+
+
+def _named_folder(text: str) -> tuple[str, str]:
+    name, equals, folder = text.partition("=")
+    if not (name and equals and folder):
+        raise UserError(f"--model {text!r} has no name and folder: write --model NAME=FOLDER.")
+    return name, folder
 
 
 def _suite_options(namespace: argparse.Namespace) -> Any:

@@ -139,6 +139,7 @@ def plan(task: Task, transitions: int, series: Series | None = None) -> list[Pha
       share equal to the training steps since the snapshot before it.
     - `full-replay`: the same up to the expert, the snapshot of highest return.
     - `medium-expert`: half medium, half expert.
+    - `expert`, which is none of the twenty tasks' tiers: the expert alone.
 
     Args:
         task: robot and tier.
@@ -170,6 +171,8 @@ def _policies(tier: str, series: Series) -> list[tuple[Snapshot | None, int]]:
         return [(None, 1)]
     if tier == "medium":
         return [(series.medium, 1)]
+    if tier == "expert":
+        return [(series.expert, 1)]
     if tier == "medium-expert":
         return [(series.medium, 1), (series.expert, 1)]
     learner = series.up_to(series.medium if tier == "medium-replay" else series.expert)

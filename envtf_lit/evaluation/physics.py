@@ -12,6 +12,8 @@ The solver starts cold rather than from the last accelerations, as it would in a
 same motion (below 1e-7 from float64 observations; contacts turn the rounding of float32 ones into up to 4e-3).
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -21,7 +23,7 @@ from torch import Tensor
 
 from envtf_lit.errors import UserError
 from envtf_lit.tasks import ROBOTS, Robot, quiet_mujoco
-from envtf_lit.world_models.horizon import Scale, Trajectories
+from envtf_lit.world_models.horizon import THRESHOLDS, Scale, Steps, Trajectories, nmse
 
 # after these MuJoCo goes on from its initial state
 GIVEN_UP = [int(getattr(mujoco.mjtWarning, f"mjWARN_BADQ{kind}")) for kind in ("POS", "VEL", "ACC")]  # pyright: ignore
@@ -130,3 +132,45 @@ def perturbed(trajectories: Trajectories, scale: Scale, size: float, *, seed: in
     first = trajectories.observations[:, 0].double().cpu().numpy()
     noise = np.random.default_rng(seed).normal(size=first.shape)
     return first + size * noise * np.where(scale.live.cpu().numpy(), scale.std.double().cpu().numpy(), 0.0)[:-1]
+
+
+@dataclass(frozen=True, eq=False)
+class Ceiling:
+    """How long real physics stays near the record when its start is slightly off: more no model can hope for.
+
+    One disturbance, at the start, is all there is; a model errs at every step. So this bounds from above.
+
+    Attributes:
+        size: of the disturbance, in standard deviations of each live dimension.
+        steps: by threshold.
+        error: (B, T) nmse of the replays, infinite where one has passed the largest threshold.
+    """
+
+    size: float
+    steps: dict[float, Steps]
+    error: Tensor
+
+
+def ceiling(
+    physics: Physics,
+    trajectories: Trajectories,
+    scale: Scale,
+    size: float,
+    *,
+    seed: int,
+    thresholds: Sequence[float] = THRESHOLDS,
+) -> Ceiling:
+    """Replays the recorded actions in MuJoCo from first states that are off by `size`.
+
+    Args:
+        physics: of the robot that was recorded.
+        trajectories: whole episodes.
+        scale: the units of the disturbance and of the nmse.
+        size: such as a model's own one-step error, the root of its mean one-step nmse.
+        seed: of the disturbance's direction.
+        thresholds: of the nmse.
+    """
+    starts = perturbed(trajectories, scale, size, seed=seed)
+    outcomes = physics.replay(trajectories, starts, scale, beyond=max(thresholds)).to(trajectories.targets.device)
+    error = nmse(outcomes, trajectories, scale)
+    return Ceiling(size, {t: Steps.within(error, trajectories.lengths, t) for t in thresholds}, error)

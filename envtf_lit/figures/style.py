@@ -28,6 +28,7 @@ COLOURS = {
     "transformer": "#D55E00",
     "context_1": "#56B4E9",
     "ensemble": "#0072B2",
+    "physics": "#000000",
 }
 LABELS = {
     "data": "dataset",

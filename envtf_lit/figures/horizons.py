@@ -1,0 +1,128 @@
+"""Plots of several world models' errors over long horizons, a panel per robot."""
+
+from itertools import cycle
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.axes import Axes
+
+from envtf_lit.figures.style import COLOURS, LABELS, drawing, write_table
+from envtf_lit.world_models.horizon import THRESHOLDS
+
+SPARE = ("#CC79A7", "#E69F00", "#F0E442", "#009E73")  # of models that have no colour of their own
+LOWEST, HIGHEST = 1e-6, 1e2  # errors that are drawn
+CEILING = "ceiling_typical"  # what median curves are to be compared with
+
+
+def error_growth(curves: pd.DataFrame, run: str, path: str | Path) -> Path:
+    """Median and quartiles of the nmse by step, a line per model; open loop with the physics ceiling beside them.
+
+    Args:
+        curves: rows of `robot`, `model`, `run`, `step`, `lower`, `median`, `upper`, `trajectories`; the ceiling is the
+            run `ceiling_typical` of the first model, whose one-step error disturbed the start.
+        run: `open_loop` or `teacher_forced`.
+        path: PNG to write; the numbers go beside it as CSV.
+    """
+    shown = curves.query("run == @run")
+    if run == "open_loop":
+        shown = pd.concat([shown, curves.query("run == @CEILING and model == model.iloc[0]")])
+    robots, colours = shown["robot"].unique(), _colours(shown)
+    with drawing(path, _size(len(robots), 3.7), 1, len(robots)) as (figure, axes):
+        for axis, robot in zip(axes.flat, robots, strict=True):
+            _panel(axis, shown.query("robot == @robot"), colours)
+            axis.set(title=robot, xlabel="step h")
+        axes[0, 0].set_ylabel("normalised squared error")
+        _legend(axes[0, -1])
+        words = "open loop, fed its own predictions" if run == "open_loop" else "teacher-forced, shown the true past"
+        figure.suptitle(f"Error on recorded actions:\n{words} (median, quartiles)")
+    write_table(path, shown)
+    return Path(path)
+
+
+def online_growth(curves: pd.DataFrame, path: str | Path) -> Path:
+    """The open-loop errors along the actions of policies that drive MuJoCo: a row per policy, a column per robot."""
+    shown = curves.query("run == 'open_loop'")
+    robots, policies, colours = shown["robot"].unique(), shown["source"].unique(), _colours(shown)
+    with drawing(path, _size(len(robots), 2.6 * len(policies)), len(policies), len(robots)) as (figure, axes):
+        for row, policy in zip(axes, policies, strict=True):
+            for axis, robot in zip(row, robots, strict=True):
+                _panel(axis, shown.query("robot == @robot and source == @policy"), colours)
+                axis.set_title(f"{robot}, {policy} policy", fontsize="medium")
+            row[0].set_ylabel("normalised squared error")
+        for axis in axes[-1]:
+            axis.set_xlabel("step h")
+        _legend(axes[0, -1])
+        figure.suptitle("Error on the actions of policies that drive MuJoCo:\nopen loop (median, quartiles)")
+    write_table(path, shown)
+    return Path(path)
+
+
+def steps_against_ceiling(lengths: pd.DataFrame, path: str | Path) -> Path:
+    """Open-loop steps against the one-step error, with what physics itself reaches when its start is off by as much.
+
+    Args:
+        lengths: rows of `robot`, `model` (`physics` for the ceiling), `threshold`, `error`, `steps`, `standard_error`.
+        path: PNG to write; the numbers go beside it as CSV.
+    """
+    robots, colours = lengths["robot"].unique(), _colours(lengths)
+    with drawing(path, _size(len(robots), 2.7 * len(THRESHOLDS)), len(THRESHOLDS), len(robots)) as (figure, axes):
+        for row, threshold in zip(axes, THRESHOLDS, strict=True):
+            for axis, robot in zip(row, robots, strict=True):
+                here = lengths.query("robot == @robot and threshold == @threshold")
+                for model, points in here.groupby("model", sort=False):
+                    axis.errorbar(
+                        points["error"],
+                        points["steps"],
+                        points["standard_error"],
+                        color=colours[str(model)],
+                        label=_label(str(model)),
+                        capsize=3,
+                        **(dict(marker=".", linestyle="--") if model == "physics" else dict(marker="o", linestyle="")),
+                    )
+                axis.set(xscale="log", title=f"{robot}, within {threshold:g}")
+                axis.set_ylim(bottom=0)
+            row[0].set_ylabel("steps")
+        for axis in axes[-1]:
+            axis.set_xlabel("typical one-step error (std)")
+        _legend(axes[0, -1])
+        figure.suptitle(
+            "Steps within a threshold, open loop, and what\nphysics reaches if its start is off by the same error"
+        )
+    write_table(path, lengths)
+    return Path(path)
+
+
+def _size(columns: int, height: float) -> tuple[float, float]:
+    """Inches of a figure, with room for the legend and two lines of title."""
+    return 3.2 * columns + 2.0, height + 0.9
+
+
+def _panel(axis: Axes, curves: pd.DataFrame, colours: dict[str, str]) -> None:
+    """Lines of every model, on logarithmic axes, with the thresholds."""
+    for name, line in curves.query("run != @CEILING").groupby("model", sort=False):
+        model = str(name)
+        axis.fill_between(line["step"], line["lower"], line["upper"], color=colours[model], alpha=0.15, lw=0)
+        axis.plot(line["step"], line["median"], color=colours[model], label=_label(model))
+    for name, line in curves.query("run == @CEILING").groupby("model", sort=False):
+        line = line[line["median"] <= max(THRESHOLDS)]  # replays end there
+        label = f"physics, off as\n{_label(str(name))}"
+        axis.plot(line["step"], line["median"], color=COLOURS["physics"], linestyle=":", zorder=3, label=label)
+    for threshold in THRESHOLDS:
+        axis.axhline(threshold, color=COLOURS["threshold"], linestyle="--", linewidth=1.0, zorder=1)
+    axis.set(xscale="log", yscale="log")
+    axis.xaxis.set_major_formatter("{x:g}")
+    low, high = axis.get_ylim()
+    axis.set_ylim(max(low, LOWEST), min(high, HIGHEST))
+
+
+def _legend(axis: Axes) -> None:
+    axis.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+def _label(model: str) -> str:
+    return LABELS.get(model, model)
+
+
+def _colours(table: pd.DataFrame) -> dict[str, str]:
+    spare = cycle(SPARE)
+    return {model: COLOURS[model] if model in COLOURS else next(spare) for model in table["model"].unique()}

@@ -1,0 +1,328 @@
+"""`envtf horizon`: how long world models track reality, for several robots, into one JSON, one table and figures."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import pandas as pd
+import torch
+
+from envtf_lit.data.cards import markdown_table
+from envtf_lit.data.formats import load_dataset, save_dataset
+from envtf_lit.errors import UserError
+from envtf_lit.evaluation.physics import Physics, ceiling
+from envtf_lit.evaluation.returns import SEED_OFFSET
+from envtf_lit.evaluation.tracking import Tracking, fresh_episodes, track, track_ceiling, track_sampled
+from envtf_lit.figures import horizons
+from envtf_lit.storage import pick_device, read_json, replacing, write_json
+from envtf_lit.suite import MODELS, WORK, Suite, SuiteOptions, build_suite
+from envtf_lit.tasks import Task, get_task
+from envtf_lit.training import run_folder
+from envtf_lit.world_models.horizon import THRESHOLDS, Scale, Trajectories, whole_episodes
+from envtf_lit.world_models.store import load_world_model
+
+ONLINE = ("random", "medium", "expert")  # policies of the zoo that drive MuJoCo
+SIZES = (1e-4, 1e-3, 1e-2, 1e-1)  # of disturbances, at which the ceiling is drawn
+RECORDED = "recorded"  # the tier's own episodes
+PHYSICS, SUITE, EPISODES = "physics", "suite", "episodes"  # parts of the work, beside the models
+
+Results = dict[str, dict[str, Tracking]]  # of a robot, by model and source of the episodes
+
+
+@dataclass(frozen=True)
+class HorizonOptions:
+    """The trajectories that models are measured on.
+
+    Attributes:
+        trajectories: fresh episodes of the tier's behaviour policies, from their first step.
+        online: fresh episodes of each of the three online policies.
+    """
+
+    trajectories: int = 300
+    online: int = 100
+
+
+def compare(
+    out: Path,
+    *,
+    robots: Sequence[str],
+    tier: str = "medium-replay",
+    work: Path = WORK,
+    options: SuiteOptions,
+    measured: HorizonOptions,
+    models: Sequence[str] = MODELS,
+    others: Mapping[str, str] | None = None,
+    progress: bool = True,
+    report: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Measures every model on every robot; what an interrupted call has measured is kept below `work`.
+
+    Args:
+        out: JSON file; a table `.md` and a folder of figures, of the same name, lie beside it.
+        robots: names.
+        tier: of the data that models are trained and measured on.
+        work: folder of suites; what was trained or measured there before with the same options is used again.
+        options: of the data and the models.
+        measured: how many episodes.
+        models: which of the suite's.
+        others: further models, name to folder; `{task}` and `{robot}` in a folder stand for those names.
+        progress: shows bars.
+        report: called with a line for each thing done.
+
+    Returns:
+        What the file holds, under flat keys: `flat_numbers` and what they depend on.
+
+    Raises:
+        UserError: an unknown robot or tier, too few episodes, a folder without a world model of the robot, or a name
+            that is taken.
+    """
+    tasks, others = [get_task(f"{robot}-{tier}") for robot in dict.fromkeys(robots)], dict(others or {})
+    for name in others:
+        if name in (*MODELS, PHYSICS) or "." in name:
+            raise UserError(f"A model cannot be called {name!r} here: choose a name of your own, without dots.")
+    if min(measured.trajectories, measured.online) < 1:
+        raise UserError("A length is a mean over at least one trajectory: ask for more than none.")
+    torch.set_num_threads(options.threads)
+    clock = _Clock([SUITE, EPISODES, PHYSICS, *models, *others], len(tasks), report)
+    found: dict[str, Results] = {}
+    numbers = _settings(tier, options, measured)
+    for task in tasks:
+        robot = task.robot.name
+        built = build_suite(task.name, work, options, models=models, progress=progress)
+        clock.done(SUITE, f"{robot}: dataset and models")
+        folders = built.folders | {name: _filled(folder, task) for name, folder in others.items()}
+        course = _Course(task, built, work / task.name, measured, progress)
+        clock.done(EPISODES, f"{robot}: {course.episodes} fresh episodes")
+        found[robot] = {PHYSICS: course.measure_physics()}
+        clock.done(PHYSICS, f"{robot}: the ceiling set by physics")
+        for name, folder in folders.items():
+            found[robot][name] = course.measure(name, folder)
+            clock.done(name, f"{robot}: {name}: {_headline(found[robot][name][RECORDED].numbers)}")
+        numbers |= {f"{robot}.{name}.train_seconds": value for name, value in built.seconds.items()}
+    numbers |= flat_numbers(found)
+    write_json(out, numbers)
+    _write_text(out.with_suffix(".md"), page(found, tier))
+    draw(found, out.with_suffix(""))
+    return numbers
+
+
+def _filled(folder: str, task: Task) -> Path:
+    return Path(folder.replace("{task}", task.name).replace("{robot}", task.robot.name))
+
+
+def _headline(numbers: Mapping[str, float]) -> str:
+    reached = ((t, numbers[f"open_loop_{t:g}"], numbers[f"ceiling_{t:g}"]) for t in THRESHOLDS)
+    return ", ".join(f"{steps:.1f} of {most:.1f} steps within {threshold:g}" for threshold, steps, most in reached)
+
+
+def _settings(tier: str, options: SuiteOptions, measured: HorizonOptions) -> dict[str, Any]:
+    """What the numbers depend on."""
+    kept = ("transitions", "updates", "context", "seed", "threads", "precision")
+    versions = {f"versions.{name}": version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")}
+    return {
+        "tier": tier,
+        **{f"suite.{name}": getattr(options, name) for name in kept},
+        **{f"measured.{name}": value for name, value in asdict(measured).items()},
+        **versions,
+    }
+
+
+class _Clock:
+    """Says what is done and about how long the rest takes, judged by the same part on other robots, or by any part.
+
+    Args:
+        parts: of the work on one robot.
+        rounds: robots.
+        report: is given the lines.
+    """
+
+    def __init__(self, parts: Sequence[str], rounds: int, report: Callable[[str], None]) -> None:
+        self.left = dict.fromkeys(parts, rounds)
+        self.report, self.begin = report, time.perf_counter()
+        self.seconds: dict[str, list[float]] = {}
+
+    def done(self, part: str, line: str) -> None:
+        """Notes that a part is done; one that lay there already tells nothing about the rest."""
+        elapsed, self.begin = time.perf_counter() - self.begin, time.perf_counter()
+        self.left[part] -= 1
+        if elapsed > 1.0:
+            self.seconds.setdefault(part, []).append(elapsed)
+        every = [value for values in self.seconds.values() for value in values] or [0.0]
+        left = sum(count * fmean(self.seconds.get(name, every)) for name, count in self.left.items())
+        self.report(f"{line} ({elapsed:.0f} s; about {left / 60:.0f} min left)")
+
+
+class _Course:
+    """One robot's episodes and physics, on which models are measured; results are kept in `home`.
+
+    Args:
+        task: robot and tier.
+        suite: gives the training data, whose spread is the unit of errors.
+        home: folder of the task.
+        measured: how many episodes.
+        progress: shows bars.
+    """
+
+    def __init__(self, task: Task, suite: Suite, home: Path, measured: HorizonOptions, progress: bool) -> None:
+        self.robot, self.home, self.seed, self.dataset = task.robot, home, suite.options.seed, suite.dataset
+        self.device = pick_device()
+        self.key = _settings(task.tier, suite.options, measured)
+        wanted = {RECORDED: (task, measured.trajectories)}
+        wanted |= {name: (Task(task.robot, name), measured.online) for name in ONLINE}
+        folder = run_folder(home, "episodes", self.key, [])
+        self.trajectories = {
+            source: self._fresh(folder / f"{source}.h5", *ask, workers=suite.options.threads, progress=progress)
+            for source, ask in wanted.items()
+        }
+        self.scale, self.physics = Scale.of(suite.split()[0], self.device), Physics(task.robot)
+
+    def _fresh(self, file: Path, task: Task, count: int, *, workers: int, progress: bool) -> Trajectories:
+        if not file.exists():
+            seed = self.seed + SEED_OFFSET
+            save_dataset(fresh_episodes(task, count, seed=seed, workers=workers, progress=progress), file)
+        return whole_episodes(load_dataset(file), count, seed=self.seed).to(self.device)
+
+    @property
+    def episodes(self) -> str:
+        return " + ".join(f"{len(found.lengths)} {source}" for source, found in self.trajectories.items())
+
+    def measure_physics(self) -> dict[str, Tracking]:
+        """Ceilings by the size of the disturbance, as text."""
+        return self._kept(PHYSICS, [], lambda: {f"{size:g}": self._ceiling("ceiling", size) for size in SIZES})
+
+    def measure(self, name: str, folder: Path) -> dict[str, Tracking]:
+        """A model's results by source of the episodes; the recorded ones with ceilings at its own one-step error."""
+        model, robot = load_world_model(folder).to(self.device), self.robot
+        if (model.observation_dim, model.action_dim) != (robot.observation_dim, robot.action_dim):
+            raise UserError(f"{folder} holds a world model of another robot: give one of {robot.name}.")
+
+        def work() -> dict[str, Tracking]:
+            found = {source: track(model, episodes, self.scale) for source, episodes in self.trajectories.items()}
+            drawn = track_sampled(model, self.trajectories[RECORDED], self.scale, seed=self.seed)
+            errors = found[RECORDED].numbers
+            most = self._ceiling("ceiling", errors["one_step_nrmse"])
+            typical = self._ceiling("ceiling_typical", errors["one_step_typical"])
+            return found | {RECORDED: found[RECORDED] | drawn | most | typical}
+
+        return self._kept(name, [folder], work)
+
+    def _ceiling(self, name: str, size: float) -> Tracking:
+        episodes = self.trajectories[RECORDED]
+        return track_ceiling(name, ceiling(self.physics, episodes, self.scale, size, seed=self.seed), episodes.lengths)
+
+    def _kept(self, name: str, inputs: list[Path], work: Callable[[], dict[str, Tracking]]) -> dict[str, Tracking]:
+        """Results of the work, now or when it was done on the same inputs."""
+        place = run_folder(self.home, f"horizon-{name}", self.key, [self.dataset, *inputs]).with_suffix(".json")
+        if not place.exists():
+            write_json(place, {source: asdict(tracking) for source, tracking in work().items()})
+        return {source: Tracking(**content) for source, content in read_json(place).items()}
+
+
+def flat_numbers(found: Mapping[str, Results]) -> dict[str, float]:
+    """`robot.model.name` of the recorded episodes, `robot.model.policy.name` online, `robot.physics.SIZE.name`."""
+    numbers = {}
+    for robot, results in found.items():
+        for model, sources in results.items():
+            for source, tracking in sources.items():
+                prefix = f"{robot}.{model}" if source == RECORDED else f"{robot}.{model}.{source}"
+                numbers |= {f"{prefix}.{name}": value for name, value in tracking.numbers.items()}
+    return numbers
+
+
+def page(found: Mapping[str, Results], tier: str) -> str:
+    """The tables in Markdown."""
+    offline, online = [], []
+    for robot, results in found.items():
+        for model, sources in results.items():
+            if model == PHYSICS:
+                continue
+            numbers = sources[RECORDED].numbers
+            offline.append(_offline_row(robot, model, numbers))
+            for source in ONLINE:
+                online.append((robot, model, source, *_online_cells(sources[source].numbers)))
+    tables = (
+        (f"Recorded actions of {tier}", OFFLINE_HEAD, offline),
+        ("Actions of policies that drive MuJoCo", ONLINE_HEAD, online),
+    )
+    return "\n".join(f"## {title}\n\n{markdown_table(head, rows)}\n" for title, head, rows in tables)
+
+
+OFFLINE_HEAD = (
+    "robot", "model", "one-step error (typical)", "open loop 0.01", "ceiling 0.01 (typical)", "open loop 0.1",
+    "ceiling 0.1 (typical)", "sampled 0.1", "teacher-forced 0.01", "censored 0.1", "exploded",
+)  # fmt: skip
+ONLINE_HEAD = ("robot", "model", "policy", "open loop 0.01", "open loop 0.1", "censored 0.1", "exploded")
+
+
+def _steps(numbers: Mapping[str, float], name: str) -> str:
+    return f"{numbers[name]:.1f} ± {numbers[f'{name}_standard_error']:.1f}"
+
+
+def _offline_row(robot: str, model: str, numbers: Mapping[str, float]) -> tuple[str, ...]:
+    def ceilings(threshold: str) -> str:
+        return f"{numbers[f'ceiling_{threshold}']:.1f} ({numbers[f'ceiling_typical_{threshold}']:.1f})"
+
+    return (
+        robot,
+        model,
+        f"{numbers['one_step_nrmse']:.3f} ({numbers['one_step_typical']:.3f})",
+        _steps(numbers, "open_loop_0.01"),
+        ceilings("0.01"),
+        _steps(numbers, "open_loop_0.1"),
+        ceilings("0.1"),
+        _steps(numbers, "sampled_open_loop_0.1"),
+        _steps(numbers, "teacher_forced_0.01"),
+        f"{numbers['open_loop_0.1_censored']:.0%}",
+        f"{numbers['explosion_rate']:.1%}",
+    )
+
+
+def _online_cells(numbers: Mapping[str, float]) -> tuple[str, ...]:
+    shares = f"{numbers['open_loop_0.1_censored']:.0%}", f"{numbers['explosion_rate']:.1%}"
+    return (*(_steps(numbers, f"open_loop_{threshold:g}") for threshold in THRESHOLDS), *shares)
+
+
+def draw(found: Mapping[str, Results], folder: Path) -> None:
+    """Every figure into a folder, each with its numbers as CSV beside it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    curves = _curves(found)
+    recorded, online = curves.query("source == @RECORDED"), curves.query("source != @RECORDED")
+    horizons.error_growth(recorded, "open_loop", folder / "open_loop.png")
+    horizons.error_growth(recorded, "teacher_forced", folder / "teacher_forced.png")
+    horizons.online_growth(online, folder / "online.png")
+    horizons.steps_against_ceiling(_lengths(found), folder / "ceiling.png")
+
+
+def _curves(found: Mapping[str, Results]) -> pd.DataFrame:
+    return pd.concat(
+        pd.DataFrame(columns).assign(robot=robot, model=model, source=source, run=run)
+        for robot, results in found.items()
+        for model, sources in results.items()
+        if model != PHYSICS
+        for source, tracking in sources.items()
+        for run, columns in tracking.curves.items()
+    )
+
+
+def _lengths(found: Mapping[str, Results]) -> pd.DataFrame:
+    """Open-loop lengths of models, and ceilings, against the size of the error that is typical of a step."""
+    rows = []
+    for robot, results in found.items():
+        for model, sources in results.items():
+            for source, tracking in sources.items():
+                if source in ONLINE:
+                    continue
+                numbers, run = tracking.numbers, "ceiling" if model == PHYSICS else "open_loop"
+                error = float(source) if model == PHYSICS else numbers["one_step_typical"]
+                for name, threshold in ((f"{run}_{threshold:g}", threshold) for threshold in THRESHOLDS):
+                    rows.append((robot, model, threshold, error, numbers[name], numbers[f"{name}_standard_error"]))
+    return pd.DataFrame(rows, columns=["robot", "model", "threshold", "error", "steps", "standard_error"])
+
+
+def _write_text(path: Path, text: str) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(text)

@@ -1,0 +1,94 @@
+"""`envtf horizon` from end to end, on episodes of at most twelve steps and models that have hardly learned."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from PIL import Image
+
+from envtf_lit import tasks
+from envtf_lit.cli import main
+from envtf_lit.errors import UserError
+from envtf_lit.evaluation import tracking
+from envtf_lit.horizon import ONLINE, SIZES, HorizonOptions, compare
+from envtf_lit.params import EnsembleOptions
+from envtf_lit.suite import MODELS, SuiteOptions
+from envtf_lit.tasks import ROBOTS, Task
+
+ENSEMBLE = EnsembleOptions(
+    members=2, elites=1, hidden=(8,), weight_decay=(0.0, 0.0), updates=2, updates_per_epoch=2, batch_size=8
+)
+TINY = SuiteOptions(transitions=500, updates=2, context=8, ensemble=ENSEMBLE, threads=1)
+PROMISED = ("open_loop_0.01", "open_loop_0.1", "teacher_forced_0.01", "explosion_rate", "ceiling_0.01")
+
+
+@pytest.fixture
+def short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = replace(ROBOTS["hopper"], max_episode_steps=12)
+    monkeypatch.setitem(tasks.TASKS, "hopper-medium", Task(robot, "medium"))
+    monkeypatch.setattr(tracking, "PROBE", 100)
+
+
+def run(folder: Path, lines: list[str], **options: Any) -> dict[str, Any]:
+    facts: dict[str, Any] = dict(robots=["hopper"], tier="medium", work=folder / "work", options=TINY, progress=False)
+    return compare(folder / "out/horizon.json", measured=HorizonOptions(6, 3), report=lines.append, **facts | options)
+
+
+@pytest.mark.usefixtures("short_episodes")
+def test_every_model_is_measured_once_and_all_of_it_is_written(tmp_path: Path) -> None:
+    lines = list[str]()
+    numbers = run(tmp_path, lines)
+    assert json.loads((tmp_path / "out/horizon.json").read_text()) == numbers
+    for name in MODELS:
+        assert {f"hopper.{name}.{key}" for key in PROMISED} <= numbers.keys()
+        assert numbers[f"hopper.{name}.trajectories"] == 6
+        assert numbers[f"hopper.{name}.expert.trajectories"] == 3
+        assert numbers[f"hopper.{name}.open_loop_0.01"] <= numbers[f"hopper.{name}.open_loop_0.1"] <= 12
+        assert numbers[f"hopper.{name}.train_seconds"] > 0
+        assert all(f"hopper.{name}.{policy}.open_loop_0.1" in numbers for policy in ONLINE)
+    ceilings = [numbers[f"hopper.physics.{size:g}.ceiling_0.01"] for size in SIZES]
+    assert ceilings[-1] < min(ceilings[:-1])
+    assert numbers["suite.updates"] == 2 and "versions.mujoco" in numbers
+    assert len(lines) == 3 + len(MODELS) and "min left" in lines[0]
+    table = (tmp_path / "out/horizon.md").read_text()
+    assert table.count("| hopper | transformer |") == 1 + len(ONLINE)
+    for name in ("open_loop", "teacher_forced", "online", "ceiling"):
+        with Image.open(tmp_path / f"out/horizon/{name}.png") as figure:
+            assert figure.size[0] > 500
+        drawn = pd.read_csv(tmp_path / f"out/horizon/{name}.csv")
+        assert set(MODELS) <= set(drawn["model"])
+
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "work").rglob("*") if path.is_file()}
+    other = {"mine": str(tmp_path / "work/{task}/models/ensemble")}
+    again = run(tmp_path, lines, others=other)
+    assert numbers.items() <= again.items()
+    assert again["hopper.mine.open_loop_0.1"] == numbers["hopper.ensemble.open_loop_0.1"]
+    assert kept == {path: path.stat().st_mtime_ns for path in kept}
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"tier": "meduim"}, "hopper-meduim"),
+        ({"others": {"ensemble": "x"}}, "cannot be called 'ensemble'"),
+        ({"others": {"a.b": "x"}}, r"cannot be called 'a\.b'"),
+        ({"measured": HorizonOptions(300, 0)}, "at least one trajectory"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_before_any_work(
+    tmp_path: Path, options: dict[str, Any], sentence: str
+) -> None:
+    facts: dict[str, Any] = dict(robots=["hopper"], work=tmp_path / "work", options=TINY, measured=HorizonOptions())
+    with pytest.raises(UserError, match=sentence):
+        compare(tmp_path / "horizon.json", **facts | options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_needs_a_name_and_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["horizon", "--out", str(tmp_path / "horizon.json"), "--model", "rambo"])
+    assert stop.value.code == 2
+    assert "write --model NAME=FOLDER" in capsys.readouterr().err
