@@ -273,6 +273,7 @@ def test_a_built_wheel_brings_the_project_template(tmp_path: Path) -> None:
     packages = [path for path in sys.path if path.endswith("site-packages")]
     (site / "borrowed.pth").write_text("\n".join(packages))
     env = environment(tmp_path / "env")
+    env.pop("PYTHONPATH", None)  # else the checkout might stand in for the wheel
 
     def call(*command: str, cwd: Path = tmp_path) -> str:
         result = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, check=False)
