@@ -24,6 +24,8 @@ STAGES = {
     "evaluate": ("Score policies and model: reports/metrics.json, plots/, video/", ["evaluate"]),
     "report": ("Execute the report notebook: reports/report.ipynb and .html", []),
 }
+# written out, since to import what knows them takes a second
+ROBOT_NAMES = ("hopper", "halfcheetah", "walker2d", "ant")
 GLOBAL_OPTIONS = ["task", "seed", "threads", "precision"]
 LIGHTNING = {
     "model": "Lightning's command line of the world model: fit, validate, test (see `envtf model --help`)",
@@ -134,7 +136,7 @@ def _add_zoo(commands: Any) -> None:
         help="processes; they do not change the data; default: one per core",
     )
     train = _add(verbs, "train", "Train behaviour policies (needs the extra `behaviour`)", _zoo_train)
-    train.add_argument("--robot", required=True, choices=["ant", "halfcheetah", "hopper", "walker2d"])
+    train.add_argument("--robot", required=True, choices=ROBOT_NAMES)
     train.add_argument("--out", type=Path, required=True, metavar="DIR", help="for build's and list's --zoo")
     train.add_argument("--algorithm", choices=["crossq", "sac"], default="crossq", help="default: crossq")
     train.add_argument("--steps", type=int, default=600_000, help="environment steps; default: 600,000")
@@ -154,8 +156,9 @@ def _add_hidden(commands: Any) -> None:
     )
     hidden.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON; the figure lies beside it")
     robots = ["halfcheetah", "walker2d"]
-    choices = ["ant", "halfcheetah", "hopper", "walker2d"]
-    hidden.add_argument("--robots", nargs="+", default=robots, choices=choices, help="default: halfcheetah walker2d")
+    hidden.add_argument(
+        "--robots", nargs="+", default=robots, choices=ROBOT_NAMES, help="default: halfcheetah walker2d"
+    )
     hidden.add_argument("--tier", default="medium-replay", help="of the data; default: medium-replay")
     hidden.add_argument("--unseen", type=_natural, default=100_000, metavar="N", help="rows to measure on; 100,000")
     _add_suite(hidden, context=32)
@@ -171,8 +174,7 @@ def _add_horizon(commands: Any) -> None:
     horizon.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help="JSON; a table and a folder of figures lie beside it"
     )
-    robots = ["hopper", "halfcheetah", "walker2d", "ant"]
-    horizon.add_argument("--robots", nargs="+", default=robots, choices=robots, help="default: all four")
+    horizon.add_argument("--robots", nargs="+", default=ROBOT_NAMES, choices=ROBOT_NAMES, help="default: all four")
     horizon.add_argument("--tier", default="medium-replay", help="of the data; default: medium-replay")
     horizon.add_argument(
         "--trajectories", type=_natural, default=300, metavar="N", help="fresh episodes with recorded actions; 300"

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from envtf_lit.data.behaviour import collect
+from envtf_lit.data.behaviour import collect, plan
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import load_dataset, save_dataset
 from envtf_lit.evaluation.recognition import Recognition, recognition, recognition_metrics, stretches
@@ -15,13 +15,8 @@ from envtf_lit.tasks import Task, get_task
 from envtf_lit.world_models.horizon import Scale
 from envtf_lit.world_models.store import load_world_model
 
-ROBOTS = ("halfcheetah", "walker2d")
-UNSEEN_TRANSITIONS, UNSEEN_SEED = (
-    100_000,
-    1_000_000,
-)  # the seed is added to the suite's: no draw of its data comes again
+UNSEEN_SEED = 1_000_000  # added to the suite's seed: no draw of its data comes again
 STRETCHES = 2_000
-CONTEXT = 32  # of the transformer
 
 
 def compare(
@@ -51,9 +46,11 @@ def compare(
         What the file holds: options, and `robot.model.metric` as `recognition_metrics` explains.
 
     Raises:
-        UserError: an unknown robot or tier, or a folder that cannot be written.
+        UserError: an unknown robot or tier, an option out of range, or a folder that cannot be written.
     """
     tasks = {robot: get_task(f"{robot}-{tier}-hidden") for robot in robots}
+    for task in tasks.values():
+        plan(task, unseen)  # complains before anything is trained
     metrics: dict[str, Any] = {"tier": tier, "transitions": options.transitions, "updates": options.updates}
     metrics |= {"context": options.context, "unseen_transitions": unseen, "stretches": STRETCHES, "seed": options.seed}
     found = dict[str, dict[str, Recognition]]()

@@ -22,7 +22,7 @@ from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.params import DownloadOptions, EnsembleOptions, ModelOptions, Params, Precision, TrainModelOptions
 from envtf_lit.storage import read_json, write_json
 from envtf_lit.tasks import Robot, get_task
-from envtf_lit.validation import check_world_model
+from envtf_lit.validation import check_ranges, check_world_model
 from envtf_lit.world_models.recalibration import calibration_split
 
 MODELS = ("transformer", "context_1", "ensemble")  # their names in every table, figure and file
@@ -91,7 +91,7 @@ def build_suite(
         progress: shows bars.
 
     Raises:
-        UserError: an unknown task or model, or options that contradict each other.
+        UserError: an unknown task or model, or options that are out of range or contradict each other.
     """
     for name in models:
         if name not in MODELS:
@@ -126,6 +126,7 @@ def _params(name: str, task: str, options: SuiteOptions) -> Params:
     elif name == "ensemble":
         train = replace(train, ensemble=options.ensemble)
     params = replace(Params(), task=task, train_model=train, **_common(options))
+    check_ranges(params)
     check_world_model(train)
     return params
 

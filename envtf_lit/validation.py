@@ -173,6 +173,15 @@ def check_download(options: DownloadOptions, *, named: bool) -> None:
             )
 
 
+def check_ranges(params: Params) -> None:
+    """Types and ranges of parameters that a program has put together; those of files pass `build_params`.
+
+    Raises:
+        UserError: an option is of the wrong type or out of range.
+    """
+    _dataclass(Params, dataclasses.asdict(params), "")
+
+
 def check_world_model(options: TrainModelOptions) -> None:
     """The rules that tie the world model's options together.
 

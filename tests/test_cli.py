@@ -62,6 +62,8 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
         (["train_policy", "?"], pipeline.ALGORITHMS),
         (["zoo", "train", "--robot", "?"], ROBOTS),
         (["zoo", "train", "--algorithm", "?"], RECIPES),
+        (["hidden", "--robots", "?"], ROBOTS),
+        (["horizon", "--robots", "?"], ROBOTS),
     ],
 )
 def test_names_that_the_command_line_writes_out_itself_are_all_there_are(

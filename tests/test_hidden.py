@@ -52,4 +52,6 @@ def test_models_are_measured_on_draws_that_none_has_seen(tmp_path: Path, monkeyp
 def test_unknown_names_are_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="halfcheetah-meduim-hidden"):
         hidden.compare(tmp_path / "hidden.json", tier="meduim", work=tmp_path, options=TINY)
+    with pytest.raises(UserError, match="1 transitions are too few"):
+        hidden.compare(tmp_path / "hidden.json", work=tmp_path, options=TINY, unseen=1)
     assert list(tmp_path.iterdir()) == []

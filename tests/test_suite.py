@@ -44,4 +44,7 @@ def test_unknown_models_and_bad_budgets_are_refused_before_any_work(tmp_path: Pa
         build_suite("hopper-medium", tmp_path, replace(TINY, updates=1_500), progress=False)
     with pytest.raises(UserError, match="elites is 4 and members is 3"):
         build_suite("hopper-medium", tmp_path, replace(TINY, ensemble=replace(ENSEMBLE, elites=4)), progress=False)
+    for option, value in (("updates", 0), ("context", 0), ("threads", 0), ("transitions", 5), ("seed", -1)):
+        with pytest.raises(UserError, match=rf"{option} is {value}, expected an integer"):
+            build_suite("hopper-medium", tmp_path, replace(TINY, **{option: value}), progress=False)
     assert list(tmp_path.iterdir()) == []
