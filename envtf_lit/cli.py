@@ -93,6 +93,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_zoo(commands)
     _add_hidden(commands)
     _add_horizon(commands)
+    _add_calibrate(commands)
     _add(commands, "doctor", "Print versions, threads, GL, disk and GPU for a bug report", _doctor)
     return parser
 
@@ -190,6 +191,18 @@ def _add_horizon(commands: Any) -> None:
         help="a further world model; {task} and {robot} in the folder stand for their names; may be repeated",
     )
     _add_suite(horizon, context=16)
+
+
+def _add_calibrate(commands: Any) -> None:
+    summary = "Measure what world models know of their own errors: coverage, detection of new data, errors of rollouts"
+    calibrate = _add(commands, "calibrate", summary, _calibrate)
+    calibrate.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="JSON; a table and a figure lie beside it"
+    )
+    robots = ["ant", "halfcheetah", "hopper", "walker2d"]
+    calibrate.add_argument("--robots", nargs="+", default=robots, choices=robots, help="default: all four")
+    calibrate.add_argument("--tier", default="medium", help="of the data; default: medium")
+    _add_suite(calibrate, context=16)
 
 
 def _add_suite(command: argparse.ArgumentParser, *, context: int) -> None:
@@ -374,6 +387,23 @@ def _horizon(namespace: argparse.Namespace, rest: list[str]) -> None:
         options=_suite_options(namespace),
         measured=HorizonOptions(namespace.trajectories, namespace.online),
         others=dict(_named_folder(text) for text in namespace.model),
+        progress=not namespace.quiet,
+        report=Console(highlight=False, markup=False, soft_wrap=True).print,
+    )
+
+
+def _calibrate(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.calibration import compare
+
+    _hush_lightning()
+    compare(
+        namespace.out,
+        robots=namespace.robots,
+        tier=namespace.tier,
+        work=namespace.work,
+        options=_suite_options(namespace),
         progress=not namespace.quiet,
         report=Console(highlight=False, markup=False, soft_wrap=True).print,
     )

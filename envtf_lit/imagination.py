@@ -93,9 +93,12 @@ class BranchPoints:
         self.starts = torch.as_tensor(dataset.episode_starts[dataset.episode_index], device=device)
 
     def draw(self, count: int, history: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Rows, each with up to `history` steps before it: the arguments of `WorldModel.init`."""
+        """Rows drawn at random, each with up to `history` steps before it: the arguments of `WorldModel.init`."""
+        return self.at(self.rows.draw((count,), generator), history)
+
+    def at(self, row: Tensor, history: int) -> tuple[Tensor, Tensor, Tensor]:
+        """These rows (B,), each with up to `history` steps before it: the arguments of `WorldModel.init`."""
         device = self.starts.device
-        row = self.rows.draw((count,), generator)
         start = torch.maximum(row - history, self.starts[row])
         index = torch.minimum(
             start[:, None] + torch.arange(history + 1, device=device), row[:, None]

@@ -1,10 +1,27 @@
-"""Coverage of predictive intervals against noise of known size."""
+"""Coverage against noise of known size; detection, ranks and errors of rollouts against hand-made cases."""
 
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
-from analytic import linear_data, linear_world
+from analytic import LinearWorld, linear_data, linear_world
+from test_transformer import batch_of, make_model, sequences
 
-from envtf_lit.evaluation.calibration import coverage
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.errors import UserError
+from envtf_lit.evaluation.calibration import (
+    auroc,
+    coverage,
+    draw_points,
+    novelties,
+    rank_correlation,
+    roc_curve,
+    rollout_errors,
+    with_uniform_actions,
+)
+from envtf_lit.tasks import never_terminated
 from envtf_lit.world_models.horizon import Scale, forecast, whole_episodes
 from envtf_lit.world_models.recalibration import standardised_residuals
 
@@ -53,3 +70,141 @@ def test_exact_predictions_without_spread_have_no_residual():
     residuals = standardised_residuals(taught, trajectories)
     assert bool((residuals[:, 2] == 0.0).all())
     assert not bool(torch.isnan(residuals).any())
+
+
+# strange pairs against familiar ones
+
+
+def test_the_area_counts_pairs_in_the_right_order():
+    # 2 stands above 1 and ties with 2; 4 stands above all three: 4.5 of 6 pairs
+    assert auroc(np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0])) == pytest.approx(0.75)
+    assert auroc(np.array([1.0, 2.0]), np.array([np.inf])) == 1.0
+    assert auroc(np.array([5.0]), np.array([1.0, 2.0])) == 0.0
+    assert auroc(np.ones(4), np.ones(3)) == 0.5
+
+
+def test_the_curve_has_the_area():
+    rng = np.random.default_rng(0)
+    familiar, strange = rng.normal(size=5_000), rng.normal(1.0, size=4_000)
+    false, true = roc_curve(familiar, strange)
+    assert (false[0], false[-1], true[-1]) == (0.0, 1.0, 1.0)
+    assert (np.diff(true) >= 0).all()
+    assert np.trapezoid(true, false) == pytest.approx(auroc(familiar, strange), abs=2e-3)
+
+
+def test_rank_correlation_by_hand():
+    assert rank_correlation(np.array([1.0, 2.0, 9.0]), np.array([0.1, 0.2, 0.3])) == pytest.approx(1.0)
+    assert rank_correlation(np.array([1.0, 2.0, 9.0]), np.array([3.0, 2.0, 1.0])) == pytest.approx(-1.0)
+    # ranks 1, 2.5, 2.5, 4 and 2, 1, 3, 4: covariance 3 over the root of 4.5 * 5
+    ties = rank_correlation(np.array([0.0, 5.0, 5.0, 7.0]), np.array([2.0, 1.0, 3.0, 4.0]))
+    assert ties == pytest.approx(3 / 22.5**0.5)
+    assert rank_correlation(np.ones(3), np.array([1.0, 2.0, 3.0])) == 0.0
+
+
+def random_log(lengths: tuple[int, ...]) -> OfflineDataset:
+    """Episodes of five observations and two actions, all numbers random."""
+    rng, rows = np.random.default_rng(0), sum(lengths)
+    observations, following = rng.normal(size=(2, rows, 5)).astype(np.float32)
+    starts = np.cumsum([0, *lengths[:-1]])
+    ends = np.isin(np.arange(rows), [*(starts[1:] - 1), rows - 1])
+    return OfflineDataset(
+        observations=observations,
+        actions=rng.uniform(-2, 3, (rows, 2)).astype(np.float32),
+        rewards=np.zeros(rows, np.float32),
+        next_observations=following,
+        terminated=np.zeros(rows, bool),
+        truncated=ends,
+        episode_starts=starts,
+        action_low=np.full(2, -2, np.float32),
+        action_high=np.full(2, 3, np.float32),
+    )
+
+
+def test_points_are_late_pairs_with_the_steps_before_them():
+    log = random_log((12, 8, 15))  # two late rows, none, and five
+    points = draw_points(log, 100, history=3, seed=0)
+    rows = [10, 11, 30, 31, 32, 33, 34]
+    assert points.lengths.tolist() == [4] * 7
+    for i, row in enumerate(rows):
+        np.testing.assert_array_equal(points.observations[i], log.observations[row - 3 : row + 1])
+        np.testing.assert_array_equal(points.past_actions[i], log.actions[row - 3 : row])
+        np.testing.assert_array_equal(points.actions[i], log.actions[row])
+    assert len(draw_points(log, 4, history=3, seed=0).actions) == 4
+    with pytest.raises(UserError, match="No episode has more than 10 steps"):
+        draw_points(log.select([1]), 4, history=3, seed=0)
+
+
+def test_uniform_actions_replace_the_last_action_alone():
+    log = random_log((60, 60))
+    points = draw_points(log, 100, history=3, seed=0)
+    other = with_uniform_actions(points, log.action_low, log.action_high, seed=0)
+    assert torch.equal(other.observations, points.observations) and torch.equal(other.past_actions, points.past_actions)
+    assert other.actions.dtype == torch.float32
+    assert -2 <= other.actions.min() < -1.8 and 2.8 < other.actions.max() <= 3
+    assert not torch.isclose(other.actions, points.actions).any()
+
+
+def test_novelty_is_that_of_the_last_token_after_the_true_past():
+    log, model = random_log((30, 30)), make_model()
+    model.fit_epistemic([batch_of(*sequences(40, 6))], generator=torch.Generator().manual_seed(0))
+    points = draw_points(log, 7, history=5, seed=0)  # the model's context is 6
+    assert model.laplace is not None
+    with torch.no_grad():
+        actions = torch.cat([points.past_actions, points.actions[:, None]], 1)
+        hidden, _ = model.encode(points.observations, actions, cached=False)
+        expected = model.laplace.leverage(hidden[:, -1]) / model.laplace.limit
+    found = novelties(model, points, batch_size=3)
+    np.testing.assert_allclose(found, expected.numpy(), rtol=1e-4)
+    with pytest.raises(UserError, match="no epistemic variance"):
+        novelties(make_model(epistemic="none"), points)
+
+
+# errors along rollouts
+
+
+@dataclass
+class TrueWorld:
+    """What really happens, in place of MuJoCo: a linear world; beyond a limit it gives up."""
+
+    world: LinearWorld
+    limit: float = float("inf")
+    robot = SimpleNamespace(terminated=never_terminated)
+
+    def step(self, observations: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        state, action = torch.from_numpy(observations).float(), torch.from_numpy(actions)
+        following = self.world.step(state, action)[0].double().numpy()
+        following[np.abs(observations).max(1) > self.limit] = np.nan
+        return following, np.zeros(len(state)), np.zeros(len(state), bool)
+
+
+class Still:
+    """No action."""
+
+    def act(self, observation: torch.Tensor, deterministic: bool, generator=None) -> torch.Tensor:
+        assert deterministic
+        return torch.zeros(len(observation), 1)
+
+
+def test_errors_are_those_of_each_step_from_the_imagined_state():
+    data, model = linear_data((40, 40)), linear_world(error=0.05, std=0.3)
+    starts, scale = draw_points(data, 6, history=2, seed=0), Scale.of(data)
+    run = rollout_errors(model, Still(), starts, TrueWorld(linear_world()), scale, steps=4)  # pyright: ignore
+    state, expected = starts.observations[torch.arange(6), starts.lengths - 1], []
+    for _ in range(4):
+        imagined, true = state @ model.matrix.T, state @ linear_world().matrix.T
+        error = ((imagined - true)[:, :2] / scale.std[:2]).square().mean(1).sqrt()  # the third never moves
+        expected.append(error)
+        state = imagined
+    np.testing.assert_allclose(run.error, torch.cat(expected).numpy(), rtol=1e-4)
+    assert (run.uncertainty == pytest.approx(0.3)) and run.given_up == 0.0
+
+
+def test_what_the_simulator_cannot_take_is_left_out_and_counted():
+    data = linear_data((40, 40))
+    starts, scale = draw_points(data, 10, history=2, seed=0), Scale.of(data)
+    states = starts.observations[torch.arange(10), starts.lengths - 1].abs().amax(1)
+    physics = TrueWorld(linear_world(), limit=float(states.median()))
+    run = rollout_errors(linear_world(), Still(), starts, physics, scale, steps=1)  # pyright: ignore
+    assert len(run.error) == len(run.uncertainty) == 5
+    assert run.given_up == pytest.approx(0.5)
+    assert (run.error == 0.0).all()

@@ -1,11 +1,27 @@
-"""Are the predicted spreads honest? Central coverage of the one-step predictive Gaussian on held-out episodes."""
+"""Does a world model know what it does not know?
 
-from dataclasses import dataclass
+Aleatoric and epistemic spread together are judged by predictive intervals on held-out episodes; epistemic variance
+alone by how well it tells strange state-action pairs from familiar ones; the uncertainty u, by which imagined rewards
+are penalised, by whether it is large where the model's own rollouts are wrong, as MuJoCo says.
+"""
 
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.errors import UserError
+from envtf_lit.evaluation.physics import Physics
+from envtf_lit.imagination import BranchPoints, imagine
+from envtf_lit.policy import Policy
 from envtf_lit.world_models.horizon import Forecast, Scale, Trajectories
+from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.recalibration import half_width, standardised_residuals
 
-LEVELS = (0.5, 0.9)
+FIRST_STEPS = 10  # of an episode: just after a reset robots are where they hardly ever are again
 
 
 @dataclass(frozen=True)
@@ -36,3 +52,142 @@ def coverage(taught: Forecast, trajectories: Trajectories, scale: Scale, level: 
     live = scale.live.tolist()
     by_dimension = tuple(value if alive else None for value, alive in zip(share.tolist(), live, strict=True))
     return Coverage(level, float(share[scale.live].mean()), by_dimension)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """N state-action pairs, each with the real steps that led to it.
+
+    Attributes:
+        observations: (N, T, S), right-padded; the last valid one is the state.
+        past_actions: (N, T - 1, A), right-padded.
+        lengths: (N,) valid observations of each row, 1 to T.
+        actions: (N, A) of the pairs.
+    """
+
+    observations: Tensor
+    past_actions: Tensor
+    lengths: Tensor
+    actions: Tensor
+
+    def to(self, device: torch.device | str) -> "Points":
+        """The same on another device."""
+        return Points(*(column.to(device) for column in (*self.starts, self.actions)))
+
+    @property
+    def starts(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The arguments of `WorldModel.init`."""
+        return self.observations, self.past_actions, self.lengths
+
+
+def draw_points(dataset: OfflineDataset, count: int, *, history: int, seed: int) -> Points:
+    """Up to `count` of a dataset's pairs, drawn without replacement, none from an episode's first 10 steps.
+
+    Args:
+        dataset: where they come from.
+        count: of pairs.
+        history: real steps before each, or fewer where the episode has no more.
+        seed: of the draw.
+
+    Raises:
+        UserError: no episode has more than 10 steps.
+    """
+    late = np.flatnonzero(np.arange(len(dataset)) - dataset.episode_starts[dataset.episode_index] >= FIRST_STEPS)
+    if len(late) == 0:
+        raise UserError(f"No episode has more than {FIRST_STEPS} steps, and the first {FIRST_STEPS} do not count.")
+    rows = np.sort(np.random.default_rng(seed).permutation(late)[:count])
+    starts = BranchPoints(dataset).at(torch.from_numpy(rows), history)
+    return Points(*starts, actions=torch.as_tensor(dataset.actions[rows]))
+
+
+def with_uniform_actions(points: Points, low: np.ndarray, high: np.ndarray, *, seed: int) -> Points:
+    """The same states, after the same steps, each with an action drawn uniformly from the action space (A,)."""
+    uniform = np.random.default_rng(seed).uniform(low, high, points.actions.shape)
+    return replace(points, actions=torch.from_numpy(uniform.astype(np.float32)))
+
+
+@torch.no_grad()
+def novelties(model: WorldModel, points: Points, *, batch_size: int = 1_024) -> np.ndarray:
+    """(N,) `Prediction.novelty` of each pair, the model shown the true past.
+
+    Raises:
+        UserError: the model has no epistemic variance.
+    """
+    found = []
+    for begin in range(0, len(points.actions), batch_size):
+        rows = slice(begin, begin + batch_size)
+        state = model.init(*(column[rows] for column in points.starts))
+        _, prediction = model.step(state, points.actions[rows])
+        if prediction.novelty is None:
+            raise UserError("This world model has no epistemic variance to tell new from known by: train another.")
+        found.append(prediction.novelty.cpu().numpy())
+    return np.concatenate(found)
+
+
+def auroc(familiar: np.ndarray, strange: np.ndarray) -> float:
+    """Chance that a strange point scores above a familiar one, ties counting half: 0.5 is a guess, 1 is always."""
+    ranks = _ranks(np.concatenate([familiar, strange]))[len(familiar) :]
+    above = ranks.sum() - len(strange) * (len(strange) + 1) / 2
+    return float(above / (len(familiar) * len(strange)))
+
+
+def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
+    """Spearman's: Pearson's correlation of the ranks, ties sharing their mean rank; 0 where either is constant."""
+    ranks = np.stack([_ranks(first), _ranks(second)])
+    if (ranks.std(1) == 0).any():
+        return 0.0
+    return float(np.corrcoef(ranks)[0, 1])
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    """(N,) from 1, ties sharing their mean rank; infinities are ends, NaN is refused."""
+    assert not np.isnan(values).any()
+    return pd.Series(values).rank().to_numpy()
+
+
+def roc_curve(familiar: np.ndarray, strange: np.ndarray, points: int = 101) -> tuple[np.ndarray, np.ndarray]:
+    """False and true alarm rates, (points,) each, as the threshold falls from above all familiar scores to below."""
+    false = np.linspace(0.0, 1.0, points)
+    thresholds = np.quantile(familiar, 1.0 - false)
+    true = (strange[None] > thresholds[:, None]).mean(1)
+    true[-1] = 1.0
+    return false, true
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutErrors:
+    """M imagined steps, each judged by the simulator restarted where the model believed it was.
+
+    Attributes:
+        uncertainty: (M,) the model's u of the step.
+        error: (M,) root mean square over live observation dimensions of (imagined - true next observation), in
+            standard deviations of the training data.
+        given_up: share of the steps whose imagined state the simulator could not take; they are left out.
+    """
+
+    uncertainty: np.ndarray
+    error: np.ndarray
+    given_up: float
+
+
+def rollout_errors(
+    model: WorldModel, policy: Policy, starts: Points, physics: Physics, scale: Scale, *, steps: int
+) -> RolloutErrors:
+    """Rolls mean predictions out under a policy's deterministic actions, from real states after real steps.
+
+    Args:
+        model: any, on the device of `starts`.
+        policy: acts on (B, S).
+        starts: states to begin at; their own actions are not used.
+        physics: of the robot; a rollout ends where its robot falls.
+        scale: the units of the error.
+        steps: of each rollout, at most.
+    """
+    run = imagine(model, policy, starts.starts, horizon=0, tail=steps, terminated=physics.robot.terminated)
+    imagined = run.next_observations.double().cpu().numpy()
+    true, _, _ = physics.step(run.observations.double().cpu().numpy(), run.actions.cpu().numpy())
+    live, std = scale.live[:-1].cpu().numpy(), scale.std[:-1].double().cpu().numpy()
+    error = np.sqrt(np.square((imagined - true)[:, live] / std[live]).mean(1))
+    uncertainty = run.uncertainty.double().cpu().numpy()
+    kept = np.isfinite(error) & np.isfinite(uncertainty)
+    return RolloutErrors(uncertainty[kept], error[kept], given_up=float(1.0 - kept.mean()))

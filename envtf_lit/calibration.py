@@ -1,0 +1,270 @@
+"""`envtf calibrate`: what models know of their own errors, for several robots, into one JSON, a table and a figure."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from envtf_lit.data.behaviour import collect, load_snapshot, read_series
+from envtf_lit.data.cards import markdown_table
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.evaluation.calibration import (
+    Points,
+    auroc,
+    coverage,
+    draw_points,
+    novelties,
+    rank_correlation,
+    roc_curve,
+    rollout_errors,
+    with_uniform_actions,
+)
+from envtf_lit.evaluation.physics import Physics
+from envtf_lit.evaluation.returns import SEED_OFFSET
+from envtf_lit.figures.calibration import calibration_page
+from envtf_lit.storage import pick_device, read_json, replacing, write_json
+from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite
+from envtf_lit.tasks import Task, get_task
+from envtf_lit.training import run_folder
+from envtf_lit.world_models.horizon import Scale, forecast, whole_episodes
+from envtf_lit.world_models.interface import WorldModel
+from envtf_lit.world_models.store import load_world_model
+
+MODELS = ("transformer", "ensemble")  # those with an epistemic variance that are compared
+CONTRASTS = ("expert", "random_policy", "random_action")  # what is strange to a model of medium data
+LEVELS = (0.05, *(k / 10 for k in range(1, 10)), 0.95)  # at which coverage is drawn
+PARTS = 20  # of a rollout's steps in order of u, at which errors are drawn
+
+Curves = dict[str, dict[str, list[float]]]  # by kind: named columns
+Measured = tuple[dict[str, float], Curves]
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """What is measured.
+
+    Attributes:
+        points: state-action pairs of each kind, or as many as there are.
+        strange_rows: transitions collected to draw those of the expert and of the random policy from.
+        episodes: held-out ones that intervals are judged on, at most.
+        rollouts: of the model, under the expert.
+        rollout_steps: of each, at most.
+    """
+
+    points: int = 4_000
+    strange_rows: int = 20_000
+    episodes: int = 50
+    rollouts: int = 200
+    rollout_steps: int = 25
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What is reported of one robot.
+
+    Attributes:
+        numbers: by name; docs/calibration.md explains them.
+        curves: what the figure shows, by model.
+    """
+
+    numbers: dict[str, float]
+    curves: dict[str, Curves]
+
+
+def compare(
+    out: Path,
+    *,
+    robots: Sequence[str],
+    tier: str = "medium",
+    work: Path = WORK,
+    options: SuiteOptions,
+    measured: CalibrationOptions = CalibrationOptions(),
+    progress: bool = True,
+    report: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Measures transformer and ensemble on every robot; what an interrupted call measured is kept below `work`.
+
+    Args:
+        out: JSON file to write after each robot, with flat keys; a table `.md` and a figure `.png` appear beside it.
+        robots: names.
+        tier: of the data that the models are trained on.
+        work: where datasets, models and results are kept, as `build_suite` has it.
+        options: how the models are trained.
+        measured: what is measured of them.
+        progress: shows bars.
+        report: called with a line for each robot.
+
+    Returns:
+        What `out` holds.
+
+    Raises:
+        UserError: an unknown robot or tier.
+    """
+    tasks = [get_task(f"{robot}-{tier}") for robot in dict.fromkeys(robots)]
+    torch.set_num_threads(options.threads)
+    found: dict[str, Findings] = {}
+    numbers = _settings(tier, options, measured)
+    for task in tasks:
+        name = task.robot.name
+        built = build_suite(task.name, work, options, models=MODELS, progress=progress)
+        found[name] = _kept(task, built, work / task.name, measured, progress)
+        numbers |= {f"{name}.{key}": value for key, value in found[name].numbers.items()}
+        write_json(out, numbers)
+        _write_text(out.with_suffix(".md"), page(found, tier))
+        calibration_page({robot: findings.curves for robot, findings in found.items()}, out.with_suffix(".png"))
+        report(f"{name}: {_headline(found[name].numbers)} ({len(found)} of {len(tasks)})")
+    return numbers
+
+
+def _settings(tier: str, suite: SuiteOptions, options: CalibrationOptions) -> dict[str, Any]:
+    """What the numbers depend on."""
+    kept = ("transitions", "updates", "context", "seed", "threads", "precision")
+    return {
+        "tier": tier,
+        **{f"suite.{name}": getattr(suite, name) for name in kept},
+        **{f"calibration.{name}": value for name, value in asdict(options).items()},
+        **{f"versions.{name}": version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")},
+    }
+
+
+def _kept(task: Task, suite: Suite, home: Path, options: CalibrationOptions, progress: bool) -> Findings:
+    """A robot's findings, now or when they were measured of the same models."""
+    key, inputs = _settings(task.tier, suite.options, options), [suite.dataset, *suite.folders.values()]
+    place = run_folder(home, "calibration", key, inputs).with_suffix(".json")
+    if not place.exists():
+        begin = time.perf_counter()
+        findings = measure(task, suite, options, progress=progress)
+        findings.numbers["seconds"] = round(time.perf_counter() - begin, 1)
+        write_json(place, asdict(findings))
+    return Findings(**read_json(place))
+
+
+def measure(task: Task, suite: Suite, options: CalibrationOptions, *, progress: bool = True) -> Findings:
+    """Everything about one robot's models, on the same episodes, pairs and first states for each.
+
+    Args:
+        task: robot and tier that the models were trained on.
+        suite: the models.
+        options: what is measured.
+        progress: shows bars while strange data are collected.
+    """
+    course = _Course(task, suite, options, progress)
+    findings = Findings({}, {})
+    for name in MODELS:
+        model = load_world_model(suite.folders[name]).to(course.device)
+        for part in (course.intervals, course.detection, course.rollouts):
+            numbers, curves = part(model)
+            findings.numbers.update({f"{name}.{key}": value for key, value in numbers.items()})
+            findings.curves.setdefault(name, {}).update(curves)
+    for level in (50, 90):  # of the model that this package is about
+        findings.numbers[f"coverage_{level}"] = findings.numbers[f"{MODELS[0]}.coverage_{level}"]
+    return findings
+
+
+class _Course:
+    """What a robot's models are measured on.
+
+    Args:
+        task: robot and tier.
+        suite: gives training and held-out episodes.
+        options: what is measured.
+        progress: shows bars.
+    """
+
+    def __init__(self, task: Task, suite: Suite, options: CalibrationOptions, progress: bool) -> None:
+        seed, self.options, self.device = suite.options.seed, options, pick_device()
+        training, held_out = suite.split()
+        self.scale = Scale.of(training, self.device)
+        self.episodes = whole_episodes(held_out, options.episodes, seed=seed).to(self.device)
+        history = suite.options.context - 1  # all that the transformer can use
+
+        def pairs(dataset: OfflineDataset, count: int = options.points, *, stream: int = 0) -> Points:
+            return draw_points(dataset, count, history=history, seed=seed + stream)
+
+        self.familiar = pairs(held_out)
+        low, high = held_out.action_low, held_out.action_high
+        self.strange = {
+            name: pairs(
+                collect(
+                    Task(task.robot, tier),
+                    options.strange_rows,
+                    seed=seed + SEED_OFFSET,
+                    workers=suite.options.threads,
+                    progress=progress,
+                )
+            )
+            for name, tier in (("expert", "expert"), ("random_policy", "random"))
+        } | {"random_action": with_uniform_actions(self.familiar, low, high, seed=seed)}
+        series = read_series(task.robot)
+        self.starts, self.physics = pairs(held_out, options.rollouts, stream=1), Physics(task.robot)
+        self.expert = load_snapshot(series, series.expert.steps).to(self.device)
+
+    def intervals(self, model: WorldModel) -> Measured:
+        """Coverage on held-out episodes."""
+        taught = forecast(model, self.episodes, feedback="recorded")
+        covered = {round(100 * level): coverage(taught, self.episodes, self.scale, level).mean for level in LEVELS}
+        curve = {"nominal": [level / 100 for level in covered], "observed": list(covered.values())}
+        return {f"coverage_{level}": covered[level] for level in (50, 90)}, {"coverage": curve}
+
+    def detection(self, model: WorldModel) -> Measured:
+        """Strange pairs against familiar ones, by epistemic variance."""
+        known = novelties(model, self.familiar.to(self.device))
+        numbers, curves = {}, {}
+        for contrast, points in self.strange.items():
+            scores = novelties(model, points.to(self.device))
+            numbers[f"auroc_{contrast}"] = auroc(known, scores)
+            false, true = roc_curve(known, scores)
+            curves[f"roc_{contrast}"] = {"false": false.tolist(), "true": true.tolist()}
+        return numbers, curves
+
+    def rollouts(self, model: WorldModel) -> Measured:
+        """The uncertainty u against the true error along the model's own rollouts."""
+        starts, steps = self.starts.to(self.device), self.options.rollout_steps
+        run = rollout_errors(model, self.expert, starts, self.physics, self.scale, steps=steps)
+        numbers = {"rank_correlation": rank_correlation(run.uncertainty, run.error), "given_up": run.given_up}
+        return numbers, {"errors": _quantiles(run.uncertainty, run.error)}
+
+
+def _quantiles(uncertainty: np.ndarray, error: np.ndarray) -> dict[str, list[float]]:
+    """Quartiles of the error, and the median u, of the steps in order of u, cut into parts of equal size."""
+    parts = np.array_split(np.argsort(uncertainty, kind="stable"), PARTS)
+    rows = [[np.median(uncertainty[part]), *np.quantile(error[part], (0.25, 0.5, 0.75))] for part in parts if len(part)]
+    return dict(zip(("uncertainty", "lower", "median", "upper"), np.transpose(rows).tolist(), strict=True))
+
+
+def _headline(numbers: Mapping[str, float]) -> str:
+    areas = (
+        f"{numbers[f'transformer.auroc_{name}']:.2f} ({numbers[f'ensemble.auroc_{name}']:.2f})" for name in CONTRASTS
+    )
+    return (
+        f"50 % intervals hold {numbers['coverage_50']:.1%}, 90 % intervals {numbers['coverage_90']:.1%}; AUROC (the "
+        f"ensemble's) {', '.join(areas)}; rank correlation {numbers['transformer.rank_correlation']:.2f} "
+        f"({numbers['ensemble.rank_correlation']:.2f})"
+    )
+
+
+HEAD = (
+    "robot", "model", "50 % interval", "90 % interval", "expert", "random policy", "random action", "own rollouts",
+)  # fmt: skip
+
+
+def page(found: Mapping[str, Findings], tier: str) -> str:
+    """The table in Markdown."""
+    names = ("coverage_50", "coverage_90", *(f"auroc_{name}" for name in CONTRASTS), "rank_correlation")
+    rows = [
+        (robot, model, *(f"{findings.numbers[f'{model}.{name}']:.3f}" for name in names))
+        for robot, findings in found.items()
+        for model in MODELS
+    ]
+    words = "Share of held-out outcomes in each interval; AUROC of each contrast; rank correlation."
+    return f"## Models of {tier} data\n\n{words}\n\n{markdown_table(HEAD, rows)}\n"
+
+
+def _write_text(path: Path, text: str) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(text)

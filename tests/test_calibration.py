@@ -1,0 +1,51 @@
+"""`envtf calibrate` from end to end: tiny models of a real robot, numbers, table and figure, and what is kept."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from PIL import Image
+
+from envtf_lit import calibration
+from envtf_lit.calibration import CONTRASTS, MODELS, CalibrationOptions
+from envtf_lit.errors import UserError
+from envtf_lit.params import EnsembleOptions
+from envtf_lit.suite import SuiteOptions
+
+ENSEMBLE = EnsembleOptions(
+    members=3, elites=2, hidden=(8,), weight_decay=(0.0, 0.0), updates=4, updates_per_epoch=2, batch_size=8
+)
+TINY = SuiteOptions(transitions=3_000, updates=2, ensemble=ENSEMBLE, threads=1)
+FEW = CalibrationOptions(points=50, strange_rows=500, episodes=2, rollouts=5, rollout_steps=3)
+
+
+@pytest.mark.filterwarnings("ignore:.*treespec, LeafSpec:FutureWarning")
+def test_models_are_measured_once_and_drawn(tmp_path: Path) -> None:
+    lines = list[str]()
+    facts: dict[str, Any] = dict(robots=["hopper"], work=tmp_path, options=TINY, measured=FEW, progress=False)
+    run = lambda out: calibration.compare(tmp_path / out, report=lines.append, **facts)  # noqa: E731
+    numbers = run("out/calibration.json")
+    assert json.loads((tmp_path / "out/calibration.json").read_text()) == numbers
+    names = ("coverage_50", "coverage_90", "rank_correlation", *(f"auroc_{name}" for name in CONTRASTS))
+    for model in MODELS:
+        assert all(-1.0 <= numbers[f"hopper.{model}.{name}"] <= 1.0 for name in names)
+    assert numbers["hopper.coverage_90"] == numbers["hopper.transformer.coverage_90"]
+    assert lines[0].startswith("hopper: 50 % intervals hold ")
+    with Image.open(tmp_path / "out/calibration.png") as figure:
+        assert figure.size[0] > 1_200
+    table = pd.read_csv(tmp_path / "out/calibration.csv")
+    assert set(table["panel"]) == {"coverage", "errors", *(f"roc_{name}" for name in CONTRASTS)}
+    assert (tmp_path / "out/calibration.md").read_text().count("| hopper |") == 2
+
+    (kept,) = (tmp_path / "hopper-medium/.envtf/runs").glob("calibration-*.json")
+    written = kept.stat().st_mtime_ns
+    assert run("again.json") == numbers  # the seconds, too: nothing was measured again
+    assert kept.stat().st_mtime_ns == written
+
+
+def test_unknown_names_are_refused_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="hopper-meduim"):
+        calibration.compare(tmp_path / "c.json", robots=["hopper"], tier="meduim", work=tmp_path, options=TINY)
+    assert list(tmp_path.iterdir()) == []
