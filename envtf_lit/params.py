@@ -40,6 +40,10 @@ class ModelOptions:
         target: `delta` predicts the scaled change of the state, `absolute` the z-scored next state (the paper's form).
         epistemic: where epistemic variance comes from: `laplace`, the posterior of the last layer, fitted after
             training; `head`, the paper's third head, trained with the rest; `none`.
+        bounded: predictions stay within the range of the training data, widened by a tenth of it at either end, so that
+            no rollout runs away.
+        scheduled_sampling: share of the input states that, in training, are the model's own predictions, which it
+            learns to correct; above 0 a second forward pass per update.
     """
 
     layers: int = 4
@@ -51,6 +55,8 @@ class ModelOptions:
     objective: Literal["beta_nll", "nll", "paper_mse"] = "beta_nll"
     target: Literal["delta", "absolute"] = "delta"
     epistemic: Literal["laplace", "head", "none"] = "laplace"
+    bounded: bool = False
+    scheduled_sampling: float = 0.0
 
 
 @dataclass(frozen=True)

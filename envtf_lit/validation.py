@@ -59,7 +59,7 @@ RANGES: dict[str, Range] = {
         ),
         _POSITIVE,
     ),
-    **dict.fromkeys(("dropout", "warmup", "discount", "trace"), _SHARE),
+    **dict.fromkeys(("dropout", "scheduled_sampling", "warmup", "discount", "trace"), _SHARE),
     "held_out": _INNER_SHARE,
     **dict.fromkeys(("real_ratio", "target_rate", "actor_average"), _NONZERO_SHARE),
     "transitions": Range(lambda value: value >= 1000, "1000 or more"),

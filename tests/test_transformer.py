@@ -2,8 +2,10 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from walker import walker_dataset
 
 from envtf_lit.errors import UserError
 from envtf_lit.params import ModelOptions
@@ -289,3 +291,52 @@ def test_what_the_weights_mean_cannot_change():
     base = EnvironmentTransformer(3, 2, **SMALL)
     with pytest.raises(UserError, match="target is delta there and absolute here"):
         EnvironmentTransformer(3, 2, **SMALL, target="absolute").start_from(base)
+
+
+def test_bounded_predictions_never_leave_the_range_of_the_data():
+    data = walker_dataset()
+    outcomes = np.column_stack([data.next_observations, data.rewards])
+    margin = 0.1 * (outcomes.max(0) - outcomes.min(0))
+    low, high = (torch.from_numpy(x) for x in (outcomes.min(0) - margin, outcomes.max(0) + margin))
+    wild = {}
+    for bounded in (False, True):
+        torch.manual_seed(0)
+        model = EnvironmentTransformer(11, 3, layers=1, heads=2, width=16, context=4, bounded=bounded).eval()
+        model.normaliser.fit(data)
+        model.head.bias.data.fill_(50.0)
+        first, actions = torch.from_numpy(data.observations[:4])[:, None], torch.zeros(4, 30, 3)
+        state, seen = model.init(first, actions[:, :0], torch.ones(4, dtype=torch.long)), []
+        for t in range(30):
+            mode = "sample" if t % 2 else "mean"
+            state, prediction = model.step(state, actions[:, t], mode=mode)
+            seen += [prediction.mean, torch.cat([prediction.observation, prediction.reward[:, None]], -1)]
+        wild[bounded] = torch.stack(seen)
+        assert ("normaliser.outcome_low" in model.state_dict()) is bounded
+    assert (wild[False] > high + 1.0).any() and torch.isfinite(wild[True]).all()
+    assert bool(((wild[True] >= low - 1e-5) & (wild[True] <= high + 1e-5)).all())
+
+
+def test_scheduled_sampling_shows_the_model_its_own_predictions_in_training_alone():
+    observations, actions = sequences(50, 6)
+    batch = dict(observations=observations, actions=actions, next_observations=observations.roll(-1, 1))
+    batch |= dict(rewards=torch.zeros(50, 6), mask=torch.ones(50, 6))
+    plain, sampling = make_model().train(), make_model(scheduled_sampling=0.3)
+    torch.testing.assert_close(sampling.eval().loss(batch), plain.loss(batch), rtol=0, atol=0)
+    assert sampling.train().loss(batch) != plain.loss(batch)
+    with torch.no_grad():
+        mean, _, _ = sampling(observations, actions)
+        predicted = sampling.normaliser.outcome(observations, mean)[:, :-1, :S]
+        mixed = sampling._partly_imagined(observations, actions)
+    assert torch.equal(mixed[:, 0], observations[:, 0])
+    own = (mixed[:, 1:] != observations[:, 1:]).any(-1)
+    torch.testing.assert_close(mixed[:, 1:][own], predicted[own])
+    assert 0.2 < own.double().mean() < 0.4
+
+
+def test_without_scheduled_sampling_nothing_is_drawn():
+    observations, actions = sequences(2, 6)
+    batch = dict(observations=observations, actions=actions, next_observations=observations)
+    batch |= dict(rewards=torch.zeros(2, 6), mask=torch.ones(2, 6))
+    model, before = make_model().train(), torch.get_rng_state()
+    model.loss(batch)
+    assert torch.equal(torch.get_rng_state(), before)

@@ -7,6 +7,7 @@ from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
 
 CONSTANT = 1e-6  # a dimension whose standard deviation is below this is constant: not live
+MARGIN = 0.1  # of a range, by which bounded outcomes may leave it
 
 
 class Normaliser(nn.Module):
@@ -14,6 +15,12 @@ class Normaliser(nn.Module):
 
     Targets are (S + 1): the state's change (`delta`) or the next state (`absolute`), then the reward, each over its own
     standard deviation. Constant dimensions keep scale 1 and are marked as not live.
+
+    Args:
+        observation_dim: S.
+        action_dim: A.
+        delta: says which targets.
+        bounded: outcomes stay within the range of those in the training data, widened at either end by `MARGIN` of it.
     """
 
     observation_mean: Tensor
@@ -23,25 +30,32 @@ class Normaliser(nn.Module):
     target_mean: Tensor
     target_std: Tensor
     live: Tensor
+    outcome_low: Tensor
+    outcome_high: Tensor
 
-    def __init__(self, observation_dim: int, action_dim: int, *, delta: bool) -> None:
+    def __init__(self, observation_dim: int, action_dim: int, *, delta: bool, bounded: bool = False) -> None:
         super().__init__()
-        self.delta = delta
+        self.delta, self.bounded = delta, bounded
         for name, size in (("observation", observation_dim), ("action", action_dim), ("target", observation_dim + 1)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
         self.register_buffer("live", torch.ones(observation_dim, dtype=torch.bool))
+        if bounded:
+            self.register_buffer("outcome_low", torch.full((observation_dim + 1,), -torch.inf))
+            self.register_buffer("outcome_high", torch.full((observation_dim + 1,), torch.inf))
 
     def fit(self, dataset: OfflineDataset) -> None:
-        """Takes means and standard deviations from the training rows."""
+        """Takes means and standard deviations, and the bounds if it has any, from the training rows."""
+
+        def outcomes(rows: slice) -> Tensor:
+            following, rewards = dataset.next_observations[rows], dataset.rewards[rows]
+            return torch.cat([torch.as_tensor(following), torch.as_tensor(rewards)[:, None]], dim=-1)
 
         def targets(rows: slice) -> Tensor:
-            following, rewards = (
-                torch.as_tensor(dataset.next_observations[rows]),
-                torch.as_tensor(dataset.rewards[rows]),
-            )
-            change = following - torch.as_tensor(dataset.observations[rows]) if self.delta else following
-            return torch.cat([change, rewards[:, None]], dim=-1)
+            outcome = outcomes(rows)
+            if self.delta:
+                outcome[:, :-1] -= torch.as_tensor(dataset.observations[rows])
+            return outcome
 
         for name, values in (
             ("observation", lambda rows: torch.as_tensor(dataset.observations[rows])),
@@ -53,6 +67,11 @@ class Normaliser(nn.Module):
             getattr(self, f"{name}_std").copy_(torch.where(std < CONSTANT, 1.0, std))
             if name == "observation":
                 self.live.copy_(std >= CONSTANT)
+        if self.bounded:
+            extremes = [torch.stack(outcomes(rows).aminmax(dim=0)) for rows in column_blocks(dataset.observations)]
+            low, high = torch.stack([e[0] for e in extremes]).amin(0), torch.stack([e[1] for e in extremes]).amax(0)
+            self.outcome_low.copy_(low - MARGIN * (high - low))
+            self.outcome_high.copy_(high + MARGIN * (high - low))
 
     def input_scale(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of what `token` z-scores, each (S + A,)."""
@@ -79,7 +98,7 @@ class Normaliser(nn.Module):
         outcome = target * self.target_std + self.target_mean
         if self.delta:
             outcome = outcome + nn.functional.pad(observation, (0, 1))
-        return outcome
+        return outcome.clamp(self.outcome_low, self.outcome_high) if self.bounded else outcome
 
     def uncertainty(self, variance: Tensor) -> Tensor:
         """Variances (..., S + 1) of unit-scale targets to `||sqrt(variance)||_2 / sqrt(S)`, (...).

@@ -150,7 +150,9 @@ class EnvironmentTransformer(nn.Module):
                 "set it to head."
             )
         self.observation_dim, self.action_dim = observation_dim, action_dim
-        self.normaliser = Normaliser(observation_dim, action_dim, delta=self.options.target == "delta")
+        self.normaliser = Normaliser(
+            observation_dim, action_dim, delta=self.options.target == "delta", bounded=self.options.bounded
+        )
         self.embed = nn.Linear(observation_dim + action_dim, width)
         self.blocks = nn.ModuleList(Block(self.options) for _ in range(self.options.layers))
         self.norm = nn.LayerNorm(width)
@@ -250,8 +252,11 @@ class EnvironmentTransformer(nn.Module):
 
     def loss(self, batch: dict[str, Tensor], *, generator: torch.Generator | None = None) -> Tensor:
         """Mean objective per valid token and output dimension of a batch of windows (see `data.loaders.Windows`)."""
-        mean, log_variance, epistemic = self(batch["observations"], batch["actions"])
-        target = self.normaliser.target(batch["observations"], batch["next_observations"], batch["rewards"])
+        observations = batch["observations"]
+        if self.training and self.options.scheduled_sampling > 0.0:
+            observations = self._partly_imagined(observations, batch["actions"])
+        mean, log_variance, epistemic = self(observations, batch["actions"])
+        target = self.normaliser.target(observations, batch["next_observations"], batch["rewards"])
         if self.options.objective == "paper_mse":
             assert epistemic is not None
             loss = paper_mse(mean, log_variance, epistemic, target, generator=generator)
@@ -260,6 +265,17 @@ class EnvironmentTransformer(nn.Module):
                 log_variance = torch.logaddexp(log_variance, epistemic)
             loss = {"nll": nll, "beta_nll": beta_nll}[self.options.objective](mean, log_variance, target)
         return (loss * batch["mask"]).sum() / (batch["mask"].sum() * target.shape[-1])
+
+    @torch.no_grad()
+    def _partly_imagined(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """Observations (B, T, S), a share of them replaced by what the model predicts from the true past.
+
+        Scheduled sampling (Bengio et al. 2015) for all tokens at once (Mihaylova and Martins 2019).
+        """
+        mean, _, _ = self(observations[:, :-1], actions[:, :-1])
+        imagined = self.normaliser.outcome(observations[:, :-1], mean)[..., :-1]  # (B, T - 1, S), of tokens 1 to T - 1
+        chosen = torch.rand(imagined.shape[:-1], device=imagined.device) < self.options.scheduled_sampling
+        return torch.cat([observations[:, :1], torch.where(chosen[..., None], imagined, observations[:, 1:])], dim=1)
 
     @torch.no_grad()
     def fit_epistemic(self, batches: Iterable[dict[str, Tensor]], *, generator: torch.Generator) -> None:
