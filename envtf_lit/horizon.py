@@ -18,7 +18,7 @@ from envtf_lit.evaluation.physics import Physics, ceiling
 from envtf_lit.evaluation.returns import SEED_OFFSET
 from envtf_lit.evaluation.tracking import Tracking, fresh_episodes, track, track_ceiling, track_sampled
 from envtf_lit.figures import horizons
-from envtf_lit.storage import pick_device, read_json, replacing, write_json
+from envtf_lit.storage import pick_device, read_json, write_json, write_text
 from envtf_lit.suite import MODELS, WORK, Suite, SuiteOptions, build_suite
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.training import run_folder
@@ -105,7 +105,7 @@ def compare(
         numbers |= {f"{robot}.{name}.train_seconds": value for name, value in built.seconds.items()}
     numbers |= flat_numbers(found)
     write_json(out, numbers)
-    _write_text(out.with_suffix(".md"), page(found, tier))
+    write_text(out.with_suffix(".md"), page(found, tier))
     draw(found, out.with_suffix(""))
     return numbers
 
@@ -321,8 +321,3 @@ def _lengths(found: Mapping[str, Results]) -> pd.DataFrame:
                 for name, threshold in ((f"{run}_{threshold:g}", threshold) for threshold in THRESHOLDS):
                     rows.append((robot, model, threshold, error, numbers[name], numbers[f"{name}_standard_error"]))
     return pd.DataFrame(rows, columns=["robot", "model", "threshold", "error", "steps", "standard_error"])
-
-
-def _write_text(path: Path, text: str) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(text)

@@ -58,11 +58,15 @@ def replacing(path: str | Path) -> Iterator[Path]:
             temporary.unlink()
 
 
-def write_json(path: str | Path, content: Any) -> None:
-    """Writes finite numbers, strings, lists and dictionaries; NaN and infinity raise ValueError."""
-    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+def write_text(path: str | Path, text: str) -> None:
+    """Writes a whole text or nothing; raises what `replacing` does."""
     with replacing(path) as temporary:
         temporary.write_text(text)
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Writes finite numbers, strings, lists and dictionaries; NaN and infinity raise ValueError."""
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: str | Path) -> Any:

@@ -12,7 +12,7 @@ from envtf_lit.data.formats import load_dataset, save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.evidence import dataset_scores
 from envtf_lit.figures.zoo import score_distributions
-from envtf_lit.storage import read_json, replacing, write_json
+from envtf_lit.storage import read_json, write_json, write_text
 from envtf_lit.tasks import ROBOTS, TASKS, Task, get_task
 
 TRANSITIONS, FULL = 200_000, 1_000_000
@@ -83,7 +83,7 @@ def build(
         report(f"{number} of {len(wanted)}, {task.name}: {outcome}")
     entries = [_entry(card) for card in _cards(out)]
     write_json(out / INDEX, [asdict(entry) for entry in entries])
-    _write_text(out / Path(INDEX).with_suffix(".md"), index_page(entries))
+    write_text(out / Path(INDEX).with_suffix(".md"), index_page(entries))
     score_distributions(_scores(entries, out), out / FIGURE)
     return entries
 
@@ -103,14 +103,9 @@ def _make(
     save_dataset(dataset, path)
     card = dataset_card(dataset, "zoo", describe_origin(task, transitions, seed, zoo))
     card |= {"seconds": round(time.perf_counter() - begin, 1), "bytes": path.stat().st_size, "workers": workers}
-    _write_text(path.with_suffix(".md"), card_page(card))
+    write_text(path.with_suffix(".md"), card_page(card))
     write_json(path.with_suffix(".json"), card)
     return _entry(card)
-
-
-def _write_text(path: Path, text: str) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(text)
 
 
 def _cards(out: Path) -> Iterator[dict[str, Any]]:
