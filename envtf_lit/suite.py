@@ -104,10 +104,15 @@ def build_suite(
     for name in models:
         folders[name] = home / "models" / name
         key = origin | {"threads": options.threads, "precision": options.precision}
-        key["train_model"] = json.loads(json.dumps(asdict(params[name].train_model)))  # tuples become lists
+        key["train_model"] = _plain(params[name].train_model)
         train = partial(_train, params[name], dataset, folders[name], home, progress)
         seconds[name] = _unless_done(home / "models" / f"{name}.json", key, train)
     return Suite(task, get_task(task).robot, options, dataset, folders, seconds)
+
+
+def _plain(options: TrainModelOptions) -> dict[str, Any]:
+    """As JSON has them, with lists for tuples."""
+    return json.loads(json.dumps(asdict(options)))
 
 
 def _common(options: SuiteOptions) -> dict[str, Any]:
@@ -133,14 +138,25 @@ def _params(name: str, task: str, options: SuiteOptions) -> Params:
 
 def _unless_done(record: Path, settings: dict[str, Any], work: Callable[[], object]) -> float:
     """Seconds that the work took, now or when it was done with the same settings."""
-    if record.exists() and (done := read_json(record)).get("settings") == settings:
-        return done["seconds"]
+    if record.exists():
+        done = read_json(record)
+        # an option that is younger than the record had its default when that was written
+        defaults = {"train_model": _plain(TrainModelOptions())} if "train_model" in settings else {}
+        if _over(defaults, done.get("settings")) == settings:
+            return done["seconds"]
     record.unlink(missing_ok=True)  # what lies there is about to be replaced
     begin = time.perf_counter()
     work()
     seconds = time.perf_counter() - begin
     write_json(record, {"settings": settings, "seconds": round(seconds, 1)})
     return round(seconds, 1)
+
+
+def _over(defaults: Any, given: Any) -> Any:
+    """What is given, completed by defaults, section by section."""
+    if not (isinstance(defaults, dict) and isinstance(given, dict)):
+        return given
+    return defaults | {name: _over(defaults.get(name), value) for name, value in given.items()}
 
 
 def _train(params: Params, dataset: Path, folder: Path, home: Path, progress: bool) -> None:

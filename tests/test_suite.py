@@ -1,5 +1,6 @@
 """The models that are compared: trained once with the same settings, and anew with others."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +31,11 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(tmp_path: Path
     assert len(training) > 500 and len(held_out) > 0
 
     written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
+    assert build_suite("hopper-medium", tmp_path, TINY, progress=False) == suite
+    record = tmp_path / "hopper-medium/models/transformer.json"
+    older = json.loads(record.read_text())
+    del older["settings"]["train_model"]["model"]["bounded"]  # as if written before there was that option
+    record.write_text(json.dumps(older))
     assert build_suite("hopper-medium", tmp_path, TINY, progress=False) == suite
     changed = replace(TINY, ensemble=replace(ENSEMBLE, hidden=(9,)))
     build_suite("hopper-medium", tmp_path, changed, progress=False)
