@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,8 @@ from envtf_lit.evaluation.calibration import (
 from envtf_lit.evaluation.physics import Physics
 from envtf_lit.evaluation.returns import SEED_OFFSET
 from envtf_lit.figures.calibration import calibration_page
-from envtf_lit.storage import pick_device, read_json, replacing, write_json
-from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite
+from envtf_lit.storage import pick_device, read_json, write_json, write_text
+from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite, flat_settings
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.training import run_folder
 from envtf_lit.world_models.horizon import Scale, forecast, whole_episodes
@@ -108,33 +107,23 @@ def compare(
     tasks = [get_task(f"{robot}-{tier}") for robot in dict.fromkeys(robots)]
     torch.set_num_threads(options.threads)
     found: dict[str, Findings] = {}
-    numbers = _settings(tier, options, measured)
+    numbers = flat_settings(tier, options, calibration=measured)
     for task in tasks:
         name = task.robot.name
         built = build_suite(task.name, work, options, models=MODELS, progress=progress)
         found[name] = _kept(task, built, work / task.name, measured, progress)
         numbers |= {f"{name}.{key}": value for key, value in found[name].numbers.items()}
         write_json(out, numbers)
-        _write_text(out.with_suffix(".md"), page(found, tier))
+        write_text(out.with_suffix(".md"), page(found, tier))
         calibration_page({robot: findings.curves for robot, findings in found.items()}, out.with_suffix(".png"))
         report(f"{name}: {_headline(found[name].numbers)} ({len(found)} of {len(tasks)})")
     return numbers
 
 
-def _settings(tier: str, suite: SuiteOptions, options: CalibrationOptions) -> dict[str, Any]:
-    """What the numbers depend on."""
-    kept = ("transitions", "updates", "context", "seed", "threads", "precision")
-    return {
-        "tier": tier,
-        **{f"suite.{name}": getattr(suite, name) for name in kept},
-        **{f"calibration.{name}": value for name, value in asdict(options).items()},
-        **{f"versions.{name}": version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")},
-    }
-
-
 def _kept(task: Task, suite: Suite, home: Path, options: CalibrationOptions, progress: bool) -> Findings:
     """A robot's findings, now or when they were measured of the same models."""
-    key, inputs = _settings(task.tier, suite.options, options), [suite.dataset, *suite.folders.values()]
+    key = flat_settings(task.tier, suite.options, calibration=options)
+    inputs = [suite.dataset, *suite.folders.values()]
     place = run_folder(home, "calibration", key, inputs).with_suffix(".json")
     if not place.exists():
         begin = time.perf_counter()
@@ -263,8 +252,3 @@ def page(found: Mapping[str, Findings], tier: str) -> str:
     ]
     words = "Share of held-out outcomes in each interval; AUROC of each contrast; rank correlation."
     return f"## Models of {tier} data\n\n{words}\n\n{markdown_table(HEAD, rows)}\n"
-
-
-def _write_text(path: Path, text: str) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(text)

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -19,7 +18,7 @@ from envtf_lit.evaluation.returns import SEED_OFFSET
 from envtf_lit.evaluation.tracking import Tracking, fresh_episodes, track, track_ceiling, track_sampled
 from envtf_lit.figures import horizons
 from envtf_lit.storage import pick_device, read_json, write_json, write_text
-from envtf_lit.suite import MODELS, WORK, Suite, SuiteOptions, build_suite
+from envtf_lit.suite import MODELS, WORK, Suite, SuiteOptions, build_suite, flat_settings
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.training import run_folder
 from envtf_lit.world_models.horizon import THRESHOLDS, Scale, Trajectories, whole_episodes
@@ -89,7 +88,7 @@ def compare(
     torch.set_num_threads(options.threads)
     clock = _Clock([SUITE, EPISODES, PHYSICS, *models, *others], len(tasks), report)
     found: dict[str, Results] = {}
-    numbers = _settings(tier, options, measured)
+    numbers = flat_settings(tier, options, measured=measured)
     for task in tasks:
         robot = task.robot.name
         built = build_suite(task.name, work, options, models=models, progress=progress)
@@ -117,18 +116,6 @@ def _filled(folder: str, task: Task) -> Path:
 def _headline(numbers: Mapping[str, float]) -> str:
     reached = ((t, numbers[f"open_loop_{t:g}"], numbers[f"ceiling_{t:g}"]) for t in THRESHOLDS)
     return ", ".join(f"{steps:.1f} of {most:.1f} steps within {threshold:g}" for threshold, steps, most in reached)
-
-
-def _settings(tier: str, options: SuiteOptions, measured: HorizonOptions) -> dict[str, Any]:
-    """What the numbers depend on."""
-    kept = ("transitions", "updates", "context", "seed", "threads", "precision")
-    versions = {f"versions.{name}": version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")}
-    return {
-        "tier": tier,
-        **{f"suite.{name}": getattr(options, name) for name in kept},
-        **{f"measured.{name}": value for name, value in asdict(measured).items()},
-        **versions,
-    }
 
 
 class _Clock:
@@ -170,7 +157,7 @@ class _Course:
     def __init__(self, task: Task, suite: Suite, home: Path, measured: HorizonOptions, progress: bool) -> None:
         self.robot, self.home, self.seed, self.dataset = task.robot, home, suite.options.seed, suite.dataset
         self.device = pick_device()
-        self.key = _settings(task.tier, suite.options, measured)
+        self.key = flat_settings(task.tier, suite.options, measured=measured)
         wanted = {RECORDED: (task, measured.trajectories)}
         wanted |= {name: (Task(task.robot, name), measured.online) for name in ONLINE}
         folder = run_folder(home, "episodes", self.key, [])

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,23 @@ class Suite:
         """The episodes that every model was trained on, and those that none was trained or calibrated on."""
         training, held_out = load_dataset(self.dataset).split(TrainModelOptions().held_out, seed=self.options.seed)
         return training, calibration_split(held_out)[1]
+
+
+def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
+    """What a comparison's numbers depend on, under flat keys: `tier`, `suite.…`, `versions.…`.
+
+    Args:
+        tier: of the data.
+        options: of the data and the models.
+        measured: dataclasses that say what is measured, under the name that goes before their keys.
+    """
+    kept = ("transitions", "updates", "context", "seed", "threads", "precision")
+    return {
+        "tier": tier,
+        **{f"suite.{name}": getattr(options, name) for name in kept},
+        **{f"{prefix}.{name}": value for prefix, what in measured.items() for name, value in asdict(what).items()},
+        **{f"versions.{name}": version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")},
+    }
 
 
 def build_suite(
