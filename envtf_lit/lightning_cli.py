@@ -6,30 +6,39 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning as L
 import torch
 from jsonargparse import Namespace
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from rich.console import Console
 
 from envtf_lit.agents.cql import CQL
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.formats import load_dataset
 from envtf_lit.data.loaders import TransitionData, WindowData
+from envtf_lit.data.minari_sets import read_minari
 from envtf_lit.errors import UserError
 from envtf_lit.params import PolicyOptions, TrainModelOptions
 from envtf_lit.policy import save_policy
-from envtf_lit.storage import replacing
+from envtf_lit.storage import read_json, replacing
 from envtf_lit.world_models.lit import LitWorldModel, lit_world_model, window_options
 from envtf_lit.world_models.store import save_world_model
+
+CONFIGS = Path(__file__).parent / "configs"
+SHIPPED = ", ".join(sorted(path.stem for path in CONFIGS.glob("*.yaml")))
 
 TRUST = (
     "A --config file is trusted like code: it may name any class to run, so take one only from where you would take a "
     "program. Weights (--model.init_from) and checkpoints (--ckpt_path) are read as data alone. A run continued with "
     "--ckpt_path keeps the checkpoint's options where no flag says otherwise: to train on for longer, add "
-    "--model.options.updates N, or --trainer.max_epochs N to leave the learning-rate schedule as it is. After fit, the "
-    "weights of the last update lie in the folder `published`, whose path is printed."
+    "--model.options.updates N, or --trainer.max_epochs N to leave the learning-rate schedule as it is. A model that "
+    "starts from another (--model.init_from) has its architecture where no flag says otherwise. After fit, the weights "
+    "of the last update, or of the best epoch where a ModelCheckpoint with a monitor says which that is, lie in the "
+    "folder `published`, whose path is printed. --config takes a file, or the name of one that comes along: "
+    f"{SHIPPED}."
 )
 
 LIGHTNINGS_OWN = re.compile(r"(best|last|hpc|registry.*|\w+://.*)$")  # checkpoints that are not local paths
@@ -41,6 +50,7 @@ def world_model(
     options: TrainModelOptions = TrainModelOptions(),  # noqa: B008 (frozen)
     seed: int = 0,
     init_from: str | None = None,
+    freeze: list[str] = [],  # noqa: B006 (read alone)
 ) -> LitWorldModel:
     """Environment Transformer, or the usual ensemble, trained on windows of a log.
 
@@ -49,9 +59,11 @@ def world_model(
         action_dim: A, taken from the data.
         options: as train_model in params.yaml.
         seed: of dropout and of sampled objectives.
-        init_from: a published model folder (as models/world_model) whose weights and scales to start from.
+        init_from: a published model folder (as models/world_model) whose weights to start from. Scales are those of the
+            new data; projections to and from another robot's dimensions begin anew.
+        freeze: parts of the model that stay as they are: embed, blocks, blocks.0, norm, head, …
     """
-    return lit_world_model(observation_dim, action_dim, options, seed, init_from)
+    return lit_world_model(observation_dim, action_dim, options, seed, init_from, freeze)
 
 
 def agent(
@@ -62,6 +74,7 @@ def agent(
     action_high: list[float] | None = None,
     seed: int = 0,
     init_from: str | None = None,
+    freeze: list[str] = [],  # noqa: B006 (read alone)
 ) -> CQL:
     """Conservative Q-Learning on a log alone.
 
@@ -72,25 +85,77 @@ def agent(
         action_low: (A,), taken from the data.
         action_high: (A,), taken from the data.
         seed: of everything random.
-        init_from: a published policy folder (as models/policy/cql) whose actor to start from; such folders hold no
-            critics, so these start anew, and the warm start fits them alone.
+        init_from: a published policy folder (as models/policy/cql) whose actor to start from, with the scales of the
+            new data; layers for another robot's dimensions begin anew. Such folders hold no critics, so these start
+            anew, and the warm start fits them alone.
+        freeze: parts of the actor that stay as they are: net.0, net.2, …
     """
-    return CQL(observation_dim, action_dim, options, action_low, action_high, seed, init_from)
+    return CQL(observation_dim, action_dim, options, action_low, action_high, seed, init_from, freeze)
+
+
+class _Sourced:
+    """Reads a dataset from where `source` says."""
+
+    source: Literal["file", "minari"]
+
+    def read(self, path: str) -> OfflineDataset:
+        """A file, or a Minari dataset of this machine; the network is for `envtf download` alone."""
+        return load_dataset(path) if self.source == "file" else read_minari(path)
+
+
+class LogWindows(_Sourced, WindowData):
+    """Windows of a log, for world models.
+
+    Args:
+        path: dataset file, HDF5 or NPZ, or a Minari dataset's id or folder.
+        source: which of the two: `file` or `minari`.
+        options: see `WindowData`.
+    """
+
+    def __init__(self, path: str, source: Literal["file", "minari"] = "file", **options: Any) -> None:
+        self.source = source
+        super().__init__(path, **options)
+
+
+class LogTransitions(_Sourced, TransitionData):
+    """Transitions of a log, for agents.
+
+    Args:
+        path: dataset file, HDF5 or NPZ, or a Minari dataset's id or folder.
+        source: which of the two: `file` or `minari`.
+        options: see `TransitionData`.
+    """
+
+    def __init__(self, path: str, source: Literal["file", "minari"] = "file", **options: Any) -> None:
+        self.source = source
+        super().__init__(path, **options)
 
 
 class Publish(Callback):
     """Writes what was trained as a model folder, for `load_world_model` or `load_policy`, beside the run's logs."""
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        state = trainer.strategy.lightning_module_state_dict()  # by all processes: each may hold a part of the weights
         if not trainer.is_global_zero:
             return
-        folder = _folder(trainer) / "published"
-        if isinstance(pl_module, LitWorldModel):
-            pl_module.fit_uncertainty(trainer.datamodule)  # pyright: ignore[reportAttributeAccessIssue]
-            save_world_model(folder, pl_module.kept)
-        elif isinstance(pl_module, CQL):
-            save_policy(folder, pl_module.average_actor)
-        Console().print(f"Published the weights of the last update: {folder}", highlight=False, soft_wrap=True)
+        folder, weights = _folder(trainer) / "published", "last update"
+        if (checkpoint := _best(trainer)) is not None:
+            state = torch.load(checkpoint.best_model_path, map_location="cpu", weights_only=True)["state_dict"]
+            weights = f"epoch of best {checkpoint.monitor}, {checkpoint.best_model_score:.4g}"
+        module = type(pl_module)(**pl_module.hparams).to(pl_module.device)  # whole, however the other one is spread
+        module.load_state_dict(state)
+        if isinstance(module, LitWorldModel):
+            module.fit_uncertainty(trainer.datamodule)  # pyright: ignore[reportAttributeAccessIssue]
+            save_world_model(folder, module.kept)
+        elif isinstance(module, CQL):
+            save_policy(folder, module.average_actor)
+        Console().print(f"Published the weights of the {weights}: {folder}", highlight=False, soft_wrap=True)
+
+
+def _best(trainer: L.Trainer) -> ModelCheckpoint | None:
+    """The callback that kept the weights of the best epoch, where one was asked to."""
+    kept = (c for c in trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint) and c.monitor is not None)
+    return next((c for c in kept if c.best_model_path), None)
 
 
 class KeepConfig(SaveConfigCallback):
@@ -136,10 +201,20 @@ class _LinkedCLI(LightningCLI):
             warnings.filterwarnings("ignore", "LightningCLI's args parameter")
             super().parse_arguments(parser, args)
             verb = self.config.subcommand
-            checkpoint = self.config[verb].ckpt_path
-            if checkpoint is not None and not LIGHTNINGS_OWN.match(checkpoint):  # below flags: the first --config
-                begin, saved = args.index(verb) + 1, {"model": _saved_options(checkpoint, self.options)}
-                super().parse_arguments(parser, [*args[:begin], "--config", json.dumps(saved), *args[begin:]])
+            checkpoint, base = self.config[verb].ckpt_path, self.config[verb].model.init_from
+            if checkpoint is not None and not LIGHTNINGS_OWN.match(checkpoint):
+                below = _saved_options(checkpoint, self.options)
+            elif base is not None:
+                below = {"options": self.architecture(read_json(Path(base) / "config.json"))}
+            else:
+                return
+            begin = args.index(verb) + 1  # below flags: the first --config
+            super().parse_arguments(parser, [*args[:begin], "--config", json.dumps({"model": below}), *args[begin:]])
+
+    @staticmethod
+    def architecture(config: dict[str, Any]) -> dict[str, Any]:
+        """The options that a published folder's weights ask for, given its config.json."""
+        raise NotImplementedError
 
     def _parse_ckpt_path(self) -> None:
         """Lightning would let the checkpoint's options win over flags; see `parse_arguments`."""
@@ -161,6 +236,11 @@ class ModelCLI(_LinkedCLI):
     verbs = ("fit", "validate", "test")
     links = {"model.options.held_out": "data.held_out", "model.seed": "data.seed"}
 
+    @staticmethod
+    def architecture(config: dict[str, Any]) -> dict[str, Any]:
+        arguments = _arguments(config, ("observation_dim", "action_dim"))
+        return {"ensemble": arguments} if config.get("kind") == "ensemble_dynamics" else {"model": arguments}
+
     def link_more(self, parser: LightningArgumentParser) -> None:
         for name in ("context", "batch_size", "updates_per_epoch", "members"):
             parser.link_arguments("model.options", f"data.{name}", compute_fn=_window_option(name))
@@ -180,6 +260,10 @@ class AgentCLI(_LinkedCLI):
         "model.options.return_temperature": "data.return_temperature",
         "model.seed": "data.seed",
     }
+
+    @staticmethod
+    def architecture(config: dict[str, Any]) -> dict[str, Any]:
+        return {name: value for name, value in _arguments(config).items() if name == "hidden"}
 
     def link_more(self, parser: LightningArgumentParser) -> None:
         updates = ("model.options.updates_per_epoch", "model.options.updates_per_step")
@@ -206,13 +290,29 @@ def _saved_options(checkpoint: str, kind: type[TrainModelOptions] | type[PolicyO
         saved = torch.load(checkpoint, map_location="cpu", weights_only=True)["hyper_parameters"]
         if not saved["options"].keys() <= {field.name for field in fields(kind)}:
             raise KeyError
-        return {name: saved[name] for name in ("options", "seed")}
+        return {name: saved[name] for name in ("options", "seed", "freeze")}
     except FileNotFoundError:
         raise UserError(f"{checkpoint} does not exist: give --ckpt_path a checkpoint of an earlier fit.") from None
     except Exception:  # whatever unpickling raises; torch's own message recommends to run code found in the file
         raise UserError(
             f"{checkpoint} is not a checkpoint of this model: give --ckpt_path a file that fit wrote."
         ) from None
+
+
+def _arguments(config: dict[str, Any], without: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The constructor's arguments in a published folder's config.json; an odd file is for the loader to refuse."""
+    arguments = config.get("arguments") if isinstance(config, dict) else None
+    return {name: value for name, value in (arguments or {}).items() if name not in without}
+
+
+def _shipped_configs(arguments: list[str]) -> Iterator[str]:
+    """The arguments, with `--config NAME` of a shipped configuration as its path."""
+    for before, argument in zip(["", *arguments], arguments, strict=False):
+        flag, _, value = argument.rpartition("=")
+        if before in ("--config", "-c") or flag == "--config":
+            shipped = CONFIGS / f"{value}.yaml"
+            value = str(shipped) if shipped.is_file() and not Path(value).exists() else value
+        yield f"{flag}={value}" if flag else value
 
 
 def run(kind: str, arguments: list[str]) -> None:
@@ -245,15 +345,18 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def _run(kind: str, arguments: list[str]) -> None:
-    cli, model, data = {"model": (ModelCLI, world_model, WindowData), "agent": (AgentCLI, agent, TransitionData)}[kind]
+    cli, model, data = {"model": (ModelCLI, world_model, LogWindows), "agent": (AgentCLI, agent, LogTransitions)}[kind]
     cli(
         model,
         data,
-        args=arguments,
+        args=[*_shipped_configs(arguments)],
         seed_everything_default=0,
         auto_configure_optimizers=False,
         trainer_defaults={"default_root_dir": ".envtf", "callbacks": [Publish()]},
         save_config_callback=KeepConfig,
         save_config_kwargs={"save_to_log_dir": False},
-        parser_kwargs={"prog": f"envtf {kind}", "description": f"{(model.__doc__ or '').splitlines()[0]} {TRUST}"},
+        parser_kwargs={
+            "prog": f"envtf {kind}",
+            "description": f"{(model.__doc__ or '').splitlines()[0]} {TRUST}",
+        },
     )

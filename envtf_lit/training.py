@@ -12,7 +12,9 @@ from typing import Any, Literal
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
+from torch import nn
 
+from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.params import Precision
 from envtf_lit.storage import replacing
 
@@ -122,6 +124,27 @@ def fit(
         module.load_state_dict(kept["state_dict"])
     shutil.rmtree(run, ignore_errors=True)
     return curves
+
+
+def freeze(module: nn.Module, parts: Sequence[str]) -> None:
+    """Keeps the parameters of these parts of a module as they are.
+
+    Args:
+        module: all others of its parameters stay trainable.
+        parts: names of submodules or parameters, such as `blocks`, `blocks.0` or `head.bias`.
+
+    Raises:
+        UserError: it has no such part, or nothing is left to train.
+    """
+    modules = [name for name, _ in module.named_modules() if name]
+    for part in parts:
+        if part not in modules and part not in dict(module.named_parameters()):
+            large = [name for name in modules if name.count(".") < 2]
+            raise UserError(f"There is no part {part!r} to freeze: {did_you_mean(part, large)}")
+    for name, parameter in module.named_parameters():
+        parameter.requires_grad_(not any(f"{name}.".startswith(f"{part}.") for part in parts))
+    if not any(parameter.requires_grad for parameter in module.parameters()):
+        raise UserError(f"Freezing {', '.join(parts)} leaves nothing to train: freeze less.")
 
 
 def autocast(device: torch.device, precision: Precision) -> torch.autocast:

@@ -1,6 +1,7 @@
 """`envtf model …` and `envtf agent …`: what comes from the data, from folders, from checkpoints, and where it goes."""
 
 import json
+import shutil
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,8 +14,9 @@ import torch
 from envtf_lit import load_policy, load_world_model, pipeline
 from envtf_lit.agents.cql import CQL
 from envtf_lit.cli import main
-from envtf_lit.data.formats import save_dataset
+from envtf_lit.data.formats import load_dataset, save_dataset
 from envtf_lit.data.loaders import TransitionData, Transitions
+from envtf_lit.data.minari_sets import write_minari
 from envtf_lit.params import Params, PolicyOptions
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from tests.walker import walker_dataset
@@ -24,6 +26,7 @@ SIZES = {
     "agent": {"hidden": [8], "updates_per_step": 2, "warm_start": 2, "batch_size": 8},
 }
 RUN = {"updates_per_epoch": 2, "updates": 4}
+OPTIONS = [f"--model.options.{name}={value}" for name, value in {**SIZES["model"], **RUN}.items()]
 QUIET = ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
 NO_LOGGER = "--trainer.logger=false"
 
@@ -131,13 +134,97 @@ def test_model_fit_trains_the_ensemble_where_its_options_stand(folder: Path) -> 
 def test_model_fit_publishes_and_starts_from_published_weights(folder: Path) -> None:
     fit("model")
     Path(".envtf/published").rename("first")
-    fit("model", "--model.init_from=first", "--model.seed=1", learning_rate=0)
+    fit("model", "--model.init_from=first", learning_rate=0)
     first, second = load_world_model("first"), load_world_model(".envtf/published")
+    assert same(first, second)  # the scale of the same data changes no bit
+    save_dataset(walker_dataset(seed=1), "data/dataset.h5")
+    fit("model", "--model.init_from=first", learning_rate=0)
+    second = load_world_model(".envtf/published")
+    assert same(first.blocks, second.blocks)
+    assert not torch.equal(first.normaliser.observation_mean, second.normaliser.observation_mean)
     assert not torch.equal(first.laplace.root, second.laplace.root)  # the posterior is that of the new data
-    second.laplace.load_state_dict(first.laplace.state_dict())
-    assert same(first, second)
-    fit("model", "--model.init_from=first", "--model.seed=1")
-    assert not same(load_world_model("first"), load_world_model(".envtf/published"))
+    inputs = torch.randn(2, 3, 11), torch.randn(2, 3, 3)
+    outcomes = [model.normaliser.outcome(inputs[0], model(*inputs)[0]) for model in (first, second)]
+    torch.testing.assert_close(outcomes[1], outcomes[0], rtol=1e-3, atol=1e-4)
+    fit("model", "--model.init_from=first")
+    assert not same(first.blocks, load_world_model(".envtf/published").blocks)
+
+
+def another_robot() -> None:
+    """The project's dataset becomes one of 8 observations and 2 actions."""
+    data = walker_dataset(seed=1)
+    narrow = dict(observations=data.observations[:, :8], next_observations=data.next_observations[:, :8])
+    limit = np.ones(2, np.float32)
+    data = replace(data, **narrow, actions=data.actions[:, :2], action_low=-limit, action_high=limit, task=None)
+    save_dataset(data, "data/dataset.h5")
+
+
+def test_another_robots_model_keeps_the_frozen_trunk_and_needs_no_flag_for_the_architecture(folder: Path) -> None:
+    fit("model")
+    Path(".envtf/published").rename("first")
+    another_robot()
+    budget = {"batch_size": 8, **RUN}
+    envtf("model", "fit", NO_LOGGER, "--model.init_from=first", "--model.freeze=[blocks, norm]", **budget)
+    first, second = load_world_model("first"), load_world_model(".envtf/published")
+    assert (second.observation_dim, second.action_dim, second.options) == (8, 2, first.options)
+    assert same(first.blocks, second.blocks) and same(first.norm, second.norm)
+    envtf("model", "fit", NO_LOGGER, "--model.init_from=first", **budget)
+    assert not same(first.blocks, load_world_model(".envtf/published").blocks)
+
+
+def test_another_robots_policy_keeps_the_frozen_hidden_layers(folder: Path) -> None:
+    fit("agent", hidden=[8, 8])
+    Path(".envtf/published").rename("first")
+    another_robot()
+    budget = {"batch_size": 8, "updates_per_step": 2, "warm_start": 2, **RUN}
+    envtf("agent", "fit", NO_LOGGER, "--model.init_from=first", "--model.freeze=[net.2]", **budget)
+    first, second = load_policy("first"), load_policy(".envtf/published")
+    assert second.arguments["observation_dim"] == 8 and second.arguments["hidden"] == [8, 8]
+    assert same(first.net[2], second.net[2]) and not torch.equal(first.net[2].weight, torch.zeros(8, 8))
+
+
+@pytest.mark.parametrize(
+    ("kind", "parts", "sentence"),
+    [
+        ("model", "[block]", "no part 'block' to freeze: did you mean 'blocks'?"),
+        ("model", "[embed, blocks, norm, head]", "leaves nothing to train"),
+        ("agent", "[nets]", "no part 'nets' to freeze"),
+    ],
+)
+def test_what_cannot_be_frozen_is_refused(
+    kind: str, parts: str, sentence: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sentence in refused(capsys, kind, "fit", NO_LOGGER, f"--model.freeze={parts}", **{**SIZES[kind], **RUN})
+
+
+def test_the_shipped_configuration_stops_early_and_publishes_the_best_epoch(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit("model")
+    Path(".envtf/published").rename("first")
+    shutil.rmtree(".envtf")
+    capsys.readouterr()
+    started = ["model", "fit", "--config=finetune", "--data.path=data/dataset.h5", "--model.init_from=first", NO_LOGGER]
+    budget = [*QUIET, *(f"--model.options.{name}=1" for name in ("batch_size", "updates_per_epoch"))]
+    main([*started, *budget, "--model.options.learning_rate=0"])  # nothing can get better
+    assert "the weights of the epoch of best val/open_loop_error" in capsys.readouterr().out
+    (checkpoint,) = Path(".envtf").rglob("*.ckpt")
+    assert "epoch=0" in checkpoint.name  # of equals the first is best
+    assert same(load_world_model("first"), load_world_model(".envtf/published"))
+    main([*started, *budget, "--model.options.learning_rate=1", "--trainer.max_epochs=4"])  # nor here, after that
+    (best,) = set(Path(".envtf").rglob("*.ckpt")) - {checkpoint}
+    kept = torch.load(best, weights_only=True)["state_dict"]
+    published = load_world_model(".envtf/published").state_dict()
+    assert all(torch.equal(kept[f"model.{name}"], published[name]) for name in published if name.startswith("blocks"))
+
+
+def test_data_of_minari_are_named_by_their_id(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
+    write_minari(load_dataset("data/dataset.h5"), "ours/walker-v0")
+    for source, path in (("file", "data/dataset.h5"), ("minari", "ours/walker-v0")):
+        main(["model", "fit", NO_LOGGER, *QUIET, f"--data.source={source}", f"--data.path={path}", *OPTIONS])
+        Path(".envtf/published").rename(f"from_{source}")
+    assert same(load_world_model("from_file"), load_world_model("from_minari"))
 
 
 def test_agent_fit_starts_its_actor_from_a_published_policy_and_warms_up_critics_alone(folder: Path) -> None:
@@ -152,8 +239,8 @@ def test_agent_fit_starts_its_actor_from_a_published_policy_and_warms_up_critics
 @pytest.mark.parametrize(
     ("kind", "change", "sentence"),
     [
-        ("model", {"model.width": 8}, "first/weights.safetensors does not fit the model"),
-        ("agent", {"hidden": [9]}, "first/weights.safetensors does not fit the model"),
+        ("model", {"model.width": 8}, "first does not fit the model: width is 16 there and 8 here"),
+        ("agent", {"hidden": [9]}, "first does not fit the actor: hidden is [8] there and [9] here"),
     ],
 )
 def test_weights_of_another_shape_are_refused(
@@ -164,7 +251,7 @@ def test_weights_of_another_shape_are_refused(
     options = {**SIZES[kind], **RUN, **change}
     assert sentence in refused(capsys, kind, "fit", NO_LOGGER, "--model.init_from=first", **options)
     missing = refused(capsys, kind, "fit", NO_LOGGER, "--model.init_from=nowhere", **options)
-    assert "nowhere/weights.safetensors does not exist" in missing
+    assert "nowhere/config.json does not exist" in missing
 
 
 # checkpoints
@@ -183,12 +270,26 @@ def test_a_continued_run_keeps_the_checkpoints_options_where_no_flag_differs(kin
 
 
 @pytest.mark.parametrize("kind", ["model", "agent"])
-def test_a_continued_run_equals_an_uninterrupted_one(kind: str, folder: Path) -> None:
-    fit(kind, "--trainer.max_epochs=1")
+@pytest.mark.parametrize("tuned", [False, True])
+def test_a_continued_run_equals_an_uninterrupted_one(kind: str, tuned: bool, folder: Path) -> None:
+    flags, options = [], {}
+    if tuned:
+        fit(kind)
+        shutil.move(".envtf/published", "base")
+        shutil.rmtree(".envtf")
+        save_dataset(walker_dataset(seed=1), "data/dataset.h5")
+        part = {"model": "blocks", "agent": "net.0"}[kind]
+        flags = ["--model.init_from=base", f"--model.freeze=[{part}]"]
+        options = {"agent": {"warm_start": 3, "updates_per_step": 1}, "model": {}}[kind]  # the kill is in the warm-up
+    fit(kind, "--trainer.max_epochs=1", *flags, **options)
     (checkpoint,) = Path(".envtf").rglob("*.ckpt")
+    if tuned:
+        Path("base").rename("elsewhere")  # a continued run needs it no more
     envtf(kind, "fit", NO_LOGGER, f"--ckpt_path={checkpoint}")
     resumed = Path(".envtf/published/weights.safetensors").read_bytes()
-    fit(kind)
+    if tuned:
+        Path("elsewhere").rename("base")
+    fit(kind, *flags, **options)
     assert Path(".envtf/published/weights.safetensors").read_bytes() == resumed
 
 

@@ -3,6 +3,7 @@
 import copy
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -10,14 +11,15 @@ import lightning as L
 import torch
 from torch import Tensor, nn
 
+from envtf_lit import training
 from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.ring import ImaginedRing
 from envtf_lit.agents.value_gradient import ValueGradient
 from envtf_lit.data.loaders import TransitionData, epoch_generator
+from envtf_lit.errors import UserError
 from envtf_lit.imagination import Imagination, Rollouts
 from envtf_lit.params import ImaginationOptions, PolicyOptions, ValueGradientOptions
-from envtf_lit.policy import TanhGaussianActor
-from envtf_lit.storage import load_weights
+from envtf_lit.policy import TanhGaussianActor, load_policy
 
 Batch = dict[str, Tensor]
 TARGET_VALUE_RATE = 0.3  # share of the state value that enters its target at each update of the actor through the model
@@ -39,10 +41,12 @@ class OfflineAgent(L.LightningModule, ABC):
         action_low, action_high: (A,), None for [-1, 1].
         seed: of everything random.
         init_from: a published policy folder whose actor to start from. The warm start then fits the critics alone.
+        freeze: parts of the actor that stay as they are, such as `net.2`.
     """
 
     log_alpha: nn.Parameter
     return_scale: Tensor
+    started: Tensor
 
     def __init__(
         self,
@@ -53,6 +57,7 @@ class OfflineAgent(L.LightningModule, ABC):
         action_high: list[float] | None = None,
         seed: int = 0,
         init_from: str | None = None,
+        freeze: Sequence[str] = (),
     ) -> None:
         super().__init__()
         self.options = _policy_options(options)
@@ -64,6 +69,7 @@ class OfflineAgent(L.LightningModule, ABC):
                 action_low=action_low,
                 action_high=action_high,
                 seed=seed,
+                freeze=list(freeze),
             )
         )
         self.automatic_optimization = False
@@ -80,6 +86,7 @@ class OfflineAgent(L.LightningModule, ABC):
         )
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.average_actor = copy.deepcopy(self.actor).requires_grad_(False)
+        training.freeze(self.actor, freeze)
         self.log_alpha = nn.Parameter(torch.tensor(self.options.initial_alpha).log())
         self.ring: ImaginedRing | None = None
         self.value_gradient: ValueGradient | None = None
@@ -91,6 +98,7 @@ class OfflineAgent(L.LightningModule, ABC):
         self.first: Rollouts | None = None
         self.reward_std = 1.0
         self.register_buffer("return_scale", torch.ones(()))  # rewards are divided by it: see `normalise_returns`
+        self.register_buffer("started", torch.tensor(False))  # the actor began from another, in a resumed run too
 
     def normalise_with(self, mean: Tensor, std: Tensor) -> None:
         """Sets the observation scale of every network."""
@@ -108,12 +116,11 @@ class OfflineAgent(L.LightningModule, ABC):
     # Lightning hooks
 
     def setup(self, stage: str) -> None:
-        """Takes scales from the dataset (the actor's, with its weights, from `init_from`) and the first rollouts."""
+        """Takes scales from the dataset, the actor's layers from `init_from`, and the first rollouts."""
         data: TransitionData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
         self.normalise_with(*data.dataset.observation_scale())
         if self.init_from is not None:
-            for actor in (self.actor, self.average_actor):
-                load_weights(actor, f"{self.init_from}/weights.safetensors")
+            self._start_from(self.init_from)
         returns = data.transitions.columns["returns"]
         self.return_variance = returns.var(correction=0).clamp(min=1e-12).item()
         if self.options.normalise_returns:
@@ -121,7 +128,17 @@ class OfflineAgent(L.LightningModule, ABC):
         if self.first is not None:
             self.remember(self.first)
 
+    def _start_from(self, folder: str) -> None:
+        base = load_policy(folder)
+        try:
+            self.actor.start_from(base)
+        except UserError as error:
+            raise UserError(f"{folder} does not fit the actor: {error}") from None
+        self.average_actor.load_state_dict(self.actor.state_dict())
+        self.started.fill_(True)
+
     def on_train_epoch_start(self) -> None:
+        self.clones = not bool(self.started)
         self.generator = epoch_generator(self.seed, self.current_epoch, "agent")
         self.update_index = self.current_epoch * self.options.updates_per_epoch
         self.logged: dict[str, list[Tensor]] = {}
@@ -195,7 +212,7 @@ class OfflineAgent(L.LightningModule, ABC):
         critic_loss = 0.5 * (q - batch["returns"]).square().mean(1).sum()
         _descend(self, critic_optimizer, critic_loss)
         clone_loss = self.clone_loss(batch | {"real": torch.ones_like(batch["rewards"])})
-        if self.init_from is None:
+        if self.clones:
             _descend(self, actor_optimizer, clone_loss)
         if self.value_gradient is not None:
             _descend(

@@ -258,8 +258,12 @@ class WindowData(L.LightningDataModule):
         super().__init__()
         self.path, self.context, self.batch_size, self.members = path, context, batch_size, members
         self.updates_per_epoch, self.share, self.seed = updates_per_epoch, held_out, seed
-        self.dataset = load_dataset(path)
+        self.dataset = self.read(path)
         self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
+
+    def read(self, path: str) -> OfflineDataset:
+        """The dataset of that path; the command line has more sources."""
+        return load_dataset(path)
 
     def setup(self, stage: str) -> None:
         """Splits the dataset; called by Lightning."""
@@ -321,10 +325,14 @@ class TransitionData(L.LightningDataModule):
         self.batch_size, self.updates_per_step, self.steps_per_epoch = batch_size, updates_per_step, steps_per_epoch
         self.discount, self.n_step, self.seed = discount, n_step, seed
         self.return_temperature = return_temperature
-        whole = load_dataset(path)
+        whole = self.read(path)
         self.dataset = whole.split(held_out, seed=seed)[0] if held_out > 0 else whole
         self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
         self.action_low, self.action_high = self.dataset.action_low.tolist(), self.dataset.action_high.tolist()
+
+    def read(self, path: str) -> OfflineDataset:
+        """The dataset of that path; the command line has more sources."""
+        return load_dataset(path)
 
     @cached_property
     def transitions(self) -> Transitions:

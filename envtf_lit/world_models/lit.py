@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -9,12 +10,14 @@ import lightning as L
 import torch
 from torch import Tensor
 
+from envtf_lit import training
 from envtf_lit.data.loaders import WindowData, epoch_generator
+from envtf_lit.errors import UserError
 from envtf_lit.params import EnsembleOptions, ModelOptions, TrainModelOptions
-from envtf_lit.storage import load_weights
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.horizon import Scale, open_loop_error, segments, whole_episodes
 from envtf_lit.world_models.recalibration import calibration_split
+from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 SELECTION_SEGMENTS, SELECTION_HORIZON = 256, 20  # open-loop stretches by which models are selected
@@ -29,11 +32,12 @@ def lit_world_model(
     options: TrainModelOptions | None = None,
     seed: int = 0,
     init_from: str | None = None,
+    freeze: Sequence[str] = (),
 ) -> "LitWorldModel":
     """The module that trains what the options name: the ensemble if they have a section for it, or the transformer."""
     options = options or TrainModelOptions()
     kind = LitWorldModel if options.ensemble is None else LitEnsemble
-    return kind(observation_dim, action_dim, options, seed, init_from)
+    return kind(observation_dim, action_dim, options, seed, init_from, freeze)
 
 
 def window_data(path: str, options: TrainModelOptions, *, seed: int) -> WindowData:
@@ -63,7 +67,8 @@ class LitWorldModel(L.LightningModule):
         action_dim: A.
         options: architecture, objective and optimisation; a plain dictionary when read from a checkpoint.
         seed: of dropout and of sampled objectives.
-        init_from: a published model folder whose weights to start from.
+        init_from: a published model folder whose weights to start from; see `start_from` of the models.
+        freeze: parts of the model that stay as they are, such as `blocks`.
     """
 
     monitor: str | None = "val/open_loop_error"
@@ -75,14 +80,22 @@ class LitWorldModel(L.LightningModule):
         options: TrainModelOptions | dict[str, Any] | None = None,
         seed: int = 0,
         init_from: str | None = None,
+        freeze: Sequence[str] = (),
     ) -> None:
         super().__init__()
         self.options = _train_options(options)
         self.save_hyperparameters(
-            dict(observation_dim=observation_dim, action_dim=action_dim, options=asdict(self.options), seed=seed)
+            dict(
+                observation_dim=observation_dim,
+                action_dim=action_dim,
+                options=asdict(self.options),
+                seed=seed,
+                freeze=list(freeze),
+            )
         )
         self.seed, self.init_from = seed, init_from
         self.model: Any = self._build(observation_dim, action_dim)
+        training.freeze(self.model, freeze)
 
     def _build(self, observation_dim: int, action_dim: int) -> EnvironmentTransformer | EnsembleDynamics:
         return EnvironmentTransformer(observation_dim, action_dim, **asdict(self.options.model))
@@ -100,10 +113,9 @@ class LitWorldModel(L.LightningModule):
     def setup(self, stage: str) -> None:
         """Takes the normaliser from the training episodes and fixes the stretches that select the model."""
         data: WindowData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
+        self.model.normaliser.fit(data.train)
         if self.init_from is not None:
-            load_weights(self.model, f"{self.init_from}/weights.safetensors")
-        else:
-            self.model.normaliser.fit(data.train)
+            _start_from(self.model, load_world_model(self.init_from), self.init_from)
         self.scale = Scale.of(data.train, self.device)
         self.segments = segments(data.held_out, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=self.seed).to(self.device)
 
@@ -179,8 +191,9 @@ class LitEnsemble(LitWorldModel):
         options: TrainModelOptions | dict[str, Any] | None = None,
         seed: int = 0,
         init_from: str | None = None,
+        freeze: Sequence[str] = (),
     ) -> None:
-        super().__init__(observation_dim, action_dim, options, seed, init_from)
+        super().__init__(observation_dim, action_dim, options, seed, init_from, freeze)
         self.best = copy.deepcopy(self.model).requires_grad_(False)  # a module, so that checkpoints hold it
         self.register_buffer("best_error", torch.full((self.ensemble.members,), torch.inf))
         self.register_buffer("stale", torch.zeros((), dtype=torch.int64))  # epochs since a member improved
@@ -251,6 +264,16 @@ class LitEnsemble(LitWorldModel):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.Adam(self.model.parameters(), lr=self.ensemble.learning_rate)
+
+
+def _start_from(model: Any, other: Any, folder: str) -> None:
+    """Lets a model start from another of its kind, read from a folder."""
+    try:
+        if type(model) is not type(other):
+            raise UserError(f"it is of another kind, {type(other).__name__}; see model.options.ensemble.")
+        model.start_from(other)
+    except UserError as error:
+        raise UserError(f"{folder} does not fit the model: {error}") from None
 
 
 def _train_options(options: TrainModelOptions | dict[str, Any] | None) -> TrainModelOptions:
