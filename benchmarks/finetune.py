@@ -1,9 +1,9 @@
 """What a model learned of one robot is worth on another: `python benchmarks/finetune.py [--out OUT.json]`.
 
 A world model is trained on `hopper-medium-replay`. Then 20,000 rows of Hopper with hidden friction, mass and strength
-are learned twice: from scratch, and from that model with a quarter of the updates (each run has a cosine schedule of its
-own length). Printed are the best held-out errors (`val/open_loop_error`, geometric mean of the open-loop nmse over 20
-steps) and the updates after which the fine-tuned model is as good as the one from scratch ever gets. All runs go
+are learned twice: from scratch, and from that model with a quarter of the updates (each run's cosine schedule is as
+long as it is). Printed are the best held-out errors (`val/open_loop_error`, geometric mean of the open-loop nmse over
+20 steps) and the updates after which the fine-tuned model is as good as the one from scratch ever gets. All runs go
 through `envtf model fit`, as a user's would; what lies in the work folder from an earlier call is used again.
 """
 
@@ -40,6 +40,7 @@ def fit(run: Path, path: Path, updates: int, options: argparse.Namespace, *flags
             "model.options.updates_per_epoch": options.every,
             "model.seed": options.seed,
             "seed_everything": options.seed,
+            "trainer.precision": "bf16-mixed",
             "trainer.logger": "CSVLogger",
             "trainer.logger.save_dir": run,
             "trainer.logger.name": "log",
