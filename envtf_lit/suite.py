@@ -118,14 +118,32 @@ def build_suite(
     origin = {"task": task, "transitions": options.transitions, "seed": options.seed}
     shared = replace(Params(), task=task, **_common(options))
     _unless_done(home / "data.json", origin, lambda: pipeline.download(shared, home, progress=progress))
-    dataset, folders, seconds = home / pipeline.DATASET, {}, {}
+    suite = Suite(task, get_task(task).robot, options, home / pipeline.DATASET, {}, {})
     for name in models:
-        folders[name] = home / "models" / name
-        key = origin | {"threads": options.threads, "precision": options.precision}
-        key["train_model"] = _plain(params[name].train_model)
-        train = partial(_train, params[name], dataset, folders[name], home, progress)
-        seconds[name] = _unless_done(home / "models" / f"{name}.json", key, train)
-    return Suite(task, get_task(task).robot, options, dataset, folders, seconds)
+        add_model(suite, name, params[name].train_model, progress=progress)
+    return suite
+
+
+def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: bool = True) -> None:
+    """Trains a model on a suite's dataset and enters it there; one that lies there, trained alike, is kept.
+
+    Args:
+        suite: gives data, seed, threads and precision.
+        name: of the model, and of its folder.
+        options: of the model and its training.
+        progress: shows a bar.
+
+    Raises:
+        UserError: options that contradict each other.
+    """
+    check_world_model(options)
+    home, shared = suite.dataset.parents[1], suite.options
+    params = replace(Params(), task=suite.task, train_model=options, **_common(shared))
+    key = {"task": suite.task, "transitions": shared.transitions, "seed": shared.seed}
+    key |= {"threads": shared.threads, "precision": shared.precision, "train_model": _plain(options)}
+    suite.folders[name] = home / "models" / name
+    train = partial(_train, params, suite.dataset, suite.folders[name], home, progress)
+    suite.seconds[name] = _unless_done(home / "models" / f"{name}.json", key, train)
 
 
 def _plain(options: TrainModelOptions) -> dict[str, Any]:

@@ -8,8 +8,8 @@ import pytest
 
 from envtf_lit import load_world_model
 from envtf_lit.errors import UserError
-from envtf_lit.params import EnsembleOptions
-from envtf_lit.suite import MODELS, SuiteOptions, build_suite
+from envtf_lit.params import EnsembleOptions, ModelOptions, TrainModelOptions
+from envtf_lit.suite import MODELS, SuiteOptions, add_model, build_suite
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
@@ -37,6 +37,9 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(tmp_path: Path
     del older["settings"]["train_model"]["model"]["bounded"]  # as if written before there was that option
     record.write_text(json.dumps(older))
     assert build_suite("hopper-medium", tmp_path, TINY, progress=False) == suite
+    options = TrainModelOptions(ModelOptions(layers=1, heads=1, width=8, bounded=True), updates=2, updates_per_epoch=2)
+    add_model(suite, "bounded", options, progress=False)
+    assert load_world_model(suite.folders.pop("bounded")).options.bounded and suite.seconds.pop("bounded") > 0
     changed = replace(TINY, ensemble=replace(ENSEMBLE, hidden=(9,)))
     build_suite("hopper-medium", tmp_path, changed, progress=False)
     anew = {path for path, time in written.items() if path.stat().st_mtime_ns != time}
