@@ -56,10 +56,15 @@ def _handler(server: Server) -> type[BaseHTTPRequestHandler]:
     return Handler
 
 
+class _Patient(ThreadingHTTPServer):
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Clients that have seen enough hang up, which is no news."""
+
+
 @contextmanager
 def serving(server: Server) -> Iterator[Server]:
     """Runs it, and fills in its `url`."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), _handler(server)) as http:
+    with _Patient(("127.0.0.1", 0), _handler(server)) as http:
         threading.Thread(target=http.serve_forever, args=(0.01,), daemon=True).start()
         server.url = f"http://127.0.0.1:{http.server_port}/some.hdf5"
         yield server
