@@ -23,6 +23,7 @@ from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 from envtf_lit.world_models.recalibration import standardised_residuals, variance_factor
 
 LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -14.0, 4.0
+CACHE_SLOTS = 8  # at the start of a rollout, doubled when full: a short one need not pay for the whole context
 
 
 def rotate(x: Tensor, positions: Tensor) -> Tensor:
@@ -106,7 +107,8 @@ class TransformerState:
     """A batch of rollouts under way: the ring cache, the clock, and the state that has no action yet.
 
     Attributes:
-        cache: per layer, keys and values (B, H, C, d); token t lies in slot t mod C.
+        cache: per layer, keys and values (B, H, C, d), C growing up to the context; token t lies in slot t mod context.
+            Slots without a token hold zeros, and products run over all of them: a part would have to be copied first.
         clock: position of the next token, the same for all rows (histories are right-aligned).
         first: (B,) position of each row's first token, or None where all rows began at 0.
         observation: (B, S) current observation.
@@ -326,7 +328,11 @@ class EnvironmentTransformer(nn.Module):
         B, T, _ = observations.shape
         current = observations[torch.arange(B, device=observations.device), lengths - 1]
         context, H, d = self.options.context, self.options.heads, self.options.width // self.options.heads
-        empty = [(current.new_empty(B, H, context, d), current.new_empty(B, H, context, d)) for _ in self.blocks]
+        slots = CACHE_SLOTS
+        while slots < T - 1:
+            slots *= 2
+        size = (B, H, min(slots, context), d)
+        cache = [(current.new_zeros(size), current.new_zeros(size)) for _ in self.blocks]
         first = None
         if T > 1:
             shift = T - lengths  # right-align: the token before the current state gets position T - 2 in every row
@@ -334,12 +340,12 @@ class EnvironmentTransformer(nn.Module):
             past = torch.take_along_dim(observations, index, 1), torch.take_along_dim(actions, index, 1)
             first = shift if bool((shift > 0).any()) else None
             _, tokens = self.encode(*past, cached=True, first=first)
-            slots = torch.arange(max(0, T - 1 - context), T - 1, device=shift.device)
-            for (keys, values), (k, v) in zip(empty, tokens, strict=True):
-                keys[:, :, slots % context] = k[:, :, slots].float()
-                values[:, :, slots % context] = v[:, :, slots].float()
+            kept = torch.arange(max(0, T - 1 - context), T - 1, device=shift.device)
+            for (keys, values), (k, v) in zip(cache, tokens, strict=True):
+                keys[:, :, kept % context] = k[:, :, kept].float()
+                values[:, :, kept % context] = v[:, :, kept].float()
         drawn = posterior * self._posterior().draw(B, generator) if posterior > 0 else None
-        return TransformerState(empty, T - 1, first, current, drawn)
+        return TransformerState(cache, T - 1, first, current, drawn)
 
     def _posterior(self) -> LastLayerLaplace:
         if self.laplace is None:
@@ -360,25 +366,30 @@ class EnvironmentTransformer(nn.Module):
         """See `WorldModel.step`. One token per call; the cache is written in place unless gradients are needed."""
         position = torch.tensor([state.clock], device=action.device)
         x = self.embed(self.normaliser.token(state.observation, action))[:, None]  # (B, 1, D)
-        filled = min(state.clock + 1, self.options.context)
-        slot, mask = state.clock % self.options.context, self._visible(state, filled)
+        slot = state.clock % self.options.context
+        before = [(self._with_room(keys, slot), self._with_room(values, slot)) for keys, values in state.cache]
+        mask = self._visible(state, before[0][0].shape[2])
         cache = []
-        for block, (keys, values) in zip(self._stack(), state.cache, strict=True):
+        for block, (keys, values) in zip(self._stack(), before, strict=True):
             q, k, v = block.attention.project(block.attention_norm(x), position)
             keys, values = _write(keys, k, slot), _write(values, v, slot)
             cache.append((keys, values))
-            q, keys, values = q.float(), keys[:, :, :filled], values[:, :, :filled]
-            x = block.finish(x, block.attention.attend(q, keys, values, mask))
+            x = block.finish(x, block.attention.attend(q.float(), keys, values, mask))
         prediction = self.predict(self.norm(x)[:, 0], state.observation, state.drawn, mode=mode, generator=generator)
         return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
 
-    def _visible(self, state: TransformerState, filled: int) -> Tensor | None:
-        """(B, 1, 1, filled) slots that hold a token of the row itself, or None where all do."""
-        if state.first is None:
+    def _with_room(self, cache: Tensor, slot: int) -> Tensor:
+        """The cache (B, H, C, d), with up to twice the slots where it lacks this one."""
+        slots = cache.shape[2]
+        return cache if slot < slots else F.pad(cache, (0, 0, 0, min(slots, self.options.context - slots)))
+
+    def _visible(self, state: TransformerState, slots: int) -> Tensor | None:
+        """(slots,) or (B, 1, 1, slots): which hold a token of the row itself, or the present one; None where all do."""
+        if state.first is None and state.clock + 1 >= slots:
             return None
-        slots = torch.arange(filled, device=state.first.device)
-        positions = state.clock - (state.clock - slots) % self.options.context
-        return (positions >= state.first[:, None])[:, None, None]
+        slot = torch.arange(slots, device=state.observation.device)
+        position = state.clock - (state.clock - slot) % self.options.context  # below zero where there is no token yet
+        return position >= 0 if state.first is None else (position >= state.first[:, None])[:, None, None]
 
     def predict(
         self,
@@ -438,8 +449,7 @@ class EnvironmentTransformer(nn.Module):
 
     def gather(self, state: TransformerState, index: Tensor) -> TransformerState:
         """See `WorldModel.gather`."""
-        filled = min(state.clock, self.options.context)
-        cache = [(_pick(keys, index, filled), _pick(values, index, filled)) for keys, values in state.cache]
+        cache = [(keys[index], values[index]) for keys, values in state.cache]
         first = None if state.first is None else state.first[index]
         drawn = None if state.drawn is None else state.drawn[index]
         return TransformerState(cache, state.clock, first, state.observation[index], drawn)
@@ -463,11 +473,3 @@ def _write(cache: Tensor, token: Tensor, slot: int) -> Tensor:
         cache = cache.clone()
     cache[:, :, slot] = token[:, :, 0].to(cache.dtype)
     return cache
-
-
-def _pick(cache: Tensor, index: Tensor, filled: int) -> Tensor:
-    """Rows (K,) of a cache (B, H, C, d), copying only the slots that hold a token."""
-    _, H, C, d = cache.shape
-    picked = cache.new_empty(len(index), H, C, d)
-    picked[:, :, :filled] = cache[index, :, :filled]
-    return picked
