@@ -94,6 +94,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_hidden(commands)
     _add_horizon(commands)
     _add_calibrate(commands)
+    _add_bench(commands)
     _add(commands, "doctor", "Print versions, threads, GL, disk and GPU for a bug report", _doctor)
     return parser
 
@@ -203,6 +204,28 @@ def _add_calibrate(commands: Any) -> None:
     calibrate.add_argument("--robots", nargs="+", default=robots, choices=robots, help="default: all four")
     calibrate.add_argument("--tier", default="medium", help="of the data; default: medium")
     _add_suite(calibrate, context=16)
+
+
+def _add_bench(commands: Any) -> None:
+    summary = "Measure the world model's speed and what its accuracy costs, beside what it would replace"
+    bench = commands.add_parser("bench", help=summary, description=f"{summary}.")
+    verbs = bench.add_subparsers(dest="verb", required=True, metavar="VERB")
+    speed = _add(
+        verbs, "model", "Imagination and training, against ensemble, simulator and matrix product", _bench_model
+    )
+    speed.add_argument("--preset", default="small", help="tiny, small, base or paper; default: small")
+    speed.add_argument("--device", metavar="NAME", help="such as cpu; default: the accelerator if there is one")
+    speed.add_argument("--precision", choices=["fp32", "bf16"], default="bf16", help="of both sides; default: bf16")
+    speed.add_argument("--batch", type=_positive, default=4_096, metavar="N", help="rollouts at a time; default: 4096")
+    speed.add_argument("--horizon", type=_positive, default=5, metavar="N", help="steps of each; default: 5")
+    speed.add_argument("--rounds", type=_positive, default=5, metavar="N", help="medians are reported; default: 5")
+    speed.add_argument("--seed", type=_natural, default=0, help="default: 0")
+    speed.add_argument("--threads", type=_positive, default=os.cpu_count() or 1, help="default: one per core")
+    cost = _add(verbs, "cost", "Training to equal held-out error: transformer, ensemble, plain network", _bench_cost)
+    cost.add_argument("--task", default="hopper-medium-replay", help="default: hopper-medium-replay")
+    _add_suite(cost, context=16)
+    for command in (speed, cost):
+        command.add_argument("--out", type=Path, metavar="FILE", help="JSON")
 
 
 def _add_suite(command: argparse.ArgumentParser, *, context: int) -> None:
@@ -416,6 +439,26 @@ def _named_folder(text: str) -> tuple[str, str]:
     return name, folder
 
 
+def _bench_model(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.bench.speed import bench_model
+
+    names = ("preset", "device", "precision", "threads", "batch", "horizon", "rounds", "seed")
+    Console().print_json(data=bench_model(namespace.out, **{name: getattr(namespace, name) for name in names}))
+
+
+def _bench_cost(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.bench.cost import bench_cost
+
+    _hush_lightning()
+    options, progress = _suite_options(namespace), not namespace.quiet
+    result = bench_cost(namespace.out, task=namespace.task, work=namespace.work, options=options, progress=progress)
+    Console().print_json(data=result)
+
+
 def _suite_options(namespace: argparse.Namespace) -> Any:
     from envtf_lit.suite import SuiteOptions
 
@@ -427,6 +470,13 @@ def _natural(text: str) -> int:
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{value} is below zero: choose 0 or more")
+    return value
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is too few: choose 1 or more")
     return value
 
 

@@ -114,7 +114,7 @@ def build_suite(
     for name in models:
         if name not in MODELS:
             raise UserError(f"Unknown model {name!r}: {did_you_mean(name, MODELS)}")
-    home, params = root / task, {name: _params(name, task, options) for name in models}
+    home, params = root / task, {name: model_params(name, task, options) for name in models}
     origin = {"task": task, "transitions": options.transitions, "seed": options.seed}
     shared = replace(Params(), task=task, **_common(options))
     _unless_done(home / "data.json", origin, lambda: pipeline.download(shared, home, progress=progress))
@@ -157,8 +157,12 @@ def _common(options: SuiteOptions) -> dict[str, Any]:
     return dict(seed=options.seed, threads=options.threads, precision=options.precision, download=download)
 
 
-def _params(name: str, task: str, options: SuiteOptions) -> Params:
-    """The parameters that train one of `MODELS`."""
+def model_params(name: str, task: str, options: SuiteOptions) -> Params:
+    """The parameters that train one of `MODELS`.
+
+    Raises:
+        UserError: options that are out of range or contradict each other.
+    """
     train = TrainModelOptions(updates=options.updates, updates_per_epoch=min(1_000, options.updates))
     train = replace(train, model=replace(train.model, context=options.context))
     if name == "context_1":  # windows of one step, as many steps per update

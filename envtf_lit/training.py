@@ -82,6 +82,7 @@ def fit(
     validate: bool = True,
     mode: Literal["min", "max"] = "min",
     gradient_clip: float | None = None,
+    callbacks: Sequence[Callback] = (),
 ) -> Curves:
     """Trains for `epochs`, resuming from `run` if a checkpoint lies there; leaves the module as it should be kept.
 
@@ -92,8 +93,9 @@ def fit(
         validate: run the validation loop after each epoch.
         mode: whether the least or the largest value of `monitor` is best.
         gradient_clip: largest gradient norm, for automatic optimisation alone.
+        callbacks: further ones.
     """
-    curves, callbacks = Curves(), list[Callback]()
+    curves, callbacks = Curves(), list(callbacks)
     if monitor is not None:
         callbacks.append(
             ModelCheckpoint(dirpath=run, filename="best", monitor=monitor, mode=mode, enable_version_counter=False)

@@ -168,13 +168,16 @@ class Windows(Dataset[dict[str, Tensor]]):
 class Resamples(Dataset[dict[str, Tensor]]):
     """Bootstrap resamples of windows: as many draws with replacement as there are windows, for each of M members.
 
-    Indexed by (M, B) positions, row m within the resample of member m.
+    A lone member, who has nobody to differ from, sees every window. Indexed by (M, B) positions, row m within the
+    resample of member m.
     """
 
     def __init__(self, windows: Windows, members: int, *, seed: int) -> None:
         self.windows = windows
         generator = epoch_generator(seed, 0, "bootstrap")
         self.drawn = torch.randint(len(windows), (members, len(windows)), generator=generator)  # (M, N)
+        if members == 1:
+            self.drawn = torch.arange(len(windows))[None]
 
     def __len__(self) -> int:
         return len(self.windows)
