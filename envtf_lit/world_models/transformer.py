@@ -74,11 +74,14 @@ class Attention(nn.Module):
     def attend(self, q: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
         """Queries (B, H, T, d) over keys and values (B, H, C, d), as two batched products; what `mask` lacks is hid."""
         with torch.autocast(q.device.type, enabled=False):  # or a fp32 cache would be cast, whole, at every step
-            score = q @ keys.transpose(-2, -1) * q.shape[-1] ** -0.5  # (B, H, T, C)
+            few = q.shape[2] == 1 and keys.shape[2] <= CACHE_SLOTS  # where a batch of tiny products is slower
+            score = (q * keys).sum(-1)[:, :, None] if few else q @ keys.transpose(-2, -1)
+            score = score * q.shape[-1] ** -0.5  # (B, H, T, C)
             if mask is not None:
                 score = score.masked_fill(~mask, float("-inf"))
             weight = F.dropout(score.float().softmax(-1), self.dropout, self.training)
-            y = weight.to(values.dtype) @ values
+            weight = weight.to(values.dtype)
+            y = (weight.mT * values).sum(2, keepdim=True) if few else weight @ values
         return self.merge(y)
 
 
@@ -108,7 +111,7 @@ class TransformerState:
 
     Attributes:
         cache: per layer, keys and values (B, H, C, d), C growing up to the context; token t lies in slot t mod context.
-            Slots without a token hold zeros, and products run over all of them: a part would have to be copied first.
+            Slots without a token hold zeros, and matrix products run over all of them: a part would have to be copied.
         clock: position of the next token, the same for all rows (histories are right-aligned).
         first: (B,) position of each row's first token, or None where all rows began at 0.
         observation: (B, S) current observation.
@@ -368,13 +371,16 @@ class EnvironmentTransformer(nn.Module):
         x = self.embed(self.normaliser.token(state.observation, action))[:, None]  # (B, 1, D)
         slot = state.clock % self.options.context
         before = [(self._with_room(keys, slot), self._with_room(values, slot)) for keys, values in state.cache]
-        mask = self._visible(state, before[0][0].shape[2])
+        filled, slots = min(state.clock + 1, self.options.context), before[0][0].shape[2]
+        seen = filled if filled <= CACHE_SLOTS else slots
+        mask = self._visible(state, seen)
         cache = []
         for block, (keys, values) in zip(self._stack(), before, strict=True):
             q, k, v = block.attention.project(block.attention_norm(x), position)
             keys, values = _write(keys, k, slot), _write(values, v, slot)
             cache.append((keys, values))
-            x = block.finish(x, block.attention.attend(q.float(), keys, values, mask))
+            attended = block.attention.attend(q.float(), keys[:, :, :seen], values[:, :, :seen], mask)
+            x = block.finish(x, attended)
         prediction = self.predict(self.norm(x)[:, 0], state.observation, state.drawn, mode=mode, generator=generator)
         return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
 
