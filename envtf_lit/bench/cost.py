@@ -110,8 +110,8 @@ def _trial(name: str, task: str, dataset: Path, root: Path, options: SuiteOption
         "parameters": sum(p.numel() for p in lit.kept.parameters()),
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
     }
-    if torch.cuda.is_available():
-        trial["peak_device_memory_mb"] = round(torch.cuda.max_memory_allocated() / 2**20)
+    if torch.accelerator.is_available():
+        trial["peak_device_memory_mb"] = round(torch.accelerator.max_memory_allocated() / 2**20)
     return trial
 
 

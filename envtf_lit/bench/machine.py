@@ -36,9 +36,9 @@ def bench_device(name: str | None) -> torch.device:
 
 def facts(device: torch.device, precision: Precision) -> dict[str, Any]:
     """Device, threads, load and versions: what belongs beside every figure."""
-    accelerator = torch.get_device_module(device).get_device_name(device) if device.type == "cuda" else None
+    named = getattr(torch.get_device_module(device), "get_device_name", None)
     return {
-        "device": accelerator or f"{device.type} ({platform.processor() or platform.machine()})",
+        "device": f"{device.type} ({platform.processor() or platform.machine()})" if named is None else named(device),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
