@@ -253,7 +253,7 @@ class OfflineAgent(L.LightningModule, ABC):
                 _descend(self, value_optimizer, value_loss)
         _follow(gradient.target_value, gradient.value, TARGET_VALUE_RATE)
         _follow(self.average_actor, self.actor, options.actor_average)
-        return dict(imagined_value=imagined * self.return_scale, value_loss=value_loss, path_clone_loss=clone_loss)
+        return dict(imagined_value=imagined * self.return_scale, value_loss=value_loss, clone_loss=clone_loss)
 
     def _optimizers(self) -> list[Any]:
         """The optimisers; those of actor, critics and alpha at the learning rates of the current update."""

@@ -21,8 +21,10 @@ TITLES = {
     "bellman_loss": "Bellman loss",
     "critic_loss": "critic loss",
     "warm_critic_loss": "critic loss, warm start",
-    "clone_loss": "actor loss, warm start",
+    "clone_loss": "-log density of real actions",
     "actor_loss": "actor loss",
+    "imagined_value": "imagined return, through the model",
+    "value_loss": "state value loss",
     "entropy": "entropy of the policy (nats)",
     "alpha": "temperature alpha",
 }
