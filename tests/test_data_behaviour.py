@@ -260,6 +260,11 @@ def check_returns(robot: Robot, steps: int, episodes: int) -> None:
     assert abs(found.returns.mean() - recorded.mean_return) <= allowed
 
 
+@pytest.mark.parametrize(("name", "score"), [("hopper", 90), ("halfcheetah", 90), ("walker2d", 80), ("ant", 80)])
+def test_experts_are_experts(name: str, score: float):
+    assert ROBOTS[name].normalised_score(read_series(ROBOTS[name]).expert.mean_return) >= score
+
+
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_experts_return_what_is_recorded(robot: Robot):
     check_returns(robot, read_series(robot).expert.steps, episodes=2)
