@@ -233,6 +233,9 @@ def _add_suite(command: argparse.ArgumentParser, *, context: int) -> None:
     command.add_argument("--work", type=Path, default=Path(".envtf/suite"), metavar="DIR", help="default: .envtf/suite")
     command.add_argument("--transitions", type=_natural, default=100_000, metavar="N", help="rows of data; 100,000")
     command.add_argument("--updates", type=_natural, default=6_000, metavar="N", help="of the transformers; 6,000")
+    command.add_argument(
+        "--ensemble-updates", type=_positive, default=100_000, metavar="N", help="of the ensemble at most; 100,000"
+    )
     command.add_argument("--context", type=_natural, default=context, metavar="N", help=f"steps; default: {context}")
     command.add_argument("--seed", type=_natural, default=0, help="default: 0")
     command.add_argument("--threads", type=_natural, default=os.cpu_count() or 1, help="default: one per core")
@@ -460,10 +463,12 @@ def _bench_cost(namespace: argparse.Namespace, rest: list[str]) -> None:
 
 
 def _suite_options(namespace: argparse.Namespace) -> Any:
+    from envtf_lit.params import EnsembleOptions
     from envtf_lit.suite import SuiteOptions
 
-    names = ("transitions", "updates", "context", "seed", "threads")
-    return SuiteOptions(**{name: getattr(namespace, name) for name in names})
+    names, most = ("transitions", "updates", "context", "seed", "threads"), namespace.ensemble_updates
+    ensemble = EnsembleOptions(updates=most, updates_per_epoch=min(EnsembleOptions().updates_per_epoch, most))
+    return SuiteOptions(ensemble=ensemble, **{name: getattr(namespace, name) for name in names})
 
 
 def _natural(text: str) -> int:

@@ -10,7 +10,7 @@ import torch
 from envtf_lit.bench.cost import _plain, bench_cost
 from envtf_lit.bench.machine import in_turns, ratio, typical
 from envtf_lit.bench.speed import _training, bench_model
-from envtf_lit.cli import main
+from envtf_lit.cli import _suite_options, build_parser, main
 from envtf_lit.params import EnsembleOptions, ModelOptions, TrainModelOptions
 from envtf_lit.suite import SuiteOptions
 from envtf_lit.tasks import ROBOTS
@@ -58,6 +58,13 @@ def test_an_unknown_device_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
     with pytest.raises(SystemExit) as stop:
         main(["bench", "model", "--device", "abacus"])
     assert stop.value.code == 2 and "No device 'abacus' here" in capsys.readouterr().err
+
+
+def test_a_suites_budgets_come_from_the_command_line() -> None:
+    parse = lambda *flags: _suite_options(build_parser().parse_args(["bench", "cost", *flags]))  # noqa: E731
+    assert parse("--threads", "2") == SuiteOptions()
+    options = parse("--updates", "20", "--ensemble-updates", "30", "--threads", "1")
+    assert (options.updates, options.ensemble.updates, options.ensemble.updates_per_epoch) == (20, 30, 30)
 
 
 def test_the_plain_network_has_the_transformers_parameters() -> None:
