@@ -200,8 +200,7 @@ def _add_calibrate(commands: Any) -> None:
     calibrate.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help="JSON; a table and a figure lie beside it"
     )
-    robots = ["ant", "halfcheetah", "hopper", "walker2d"]
-    calibrate.add_argument("--robots", nargs="+", default=robots, choices=robots, help="default: all four")
+    calibrate.add_argument("--robots", nargs="+", default=ROBOT_NAMES, choices=ROBOT_NAMES, help="default: all four")
     calibrate.add_argument("--tier", default="medium", help="of the data; default: medium")
     _add_suite(calibrate, context=16)
 

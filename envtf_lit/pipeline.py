@@ -19,6 +19,7 @@ from envtf_lit.storage import pick_device, read_json, replacing, write_json
 from envtf_lit.tasks import Robot, get_task, never_terminated
 
 DATASET, CARD = Path("data/dataset.h5"), Path("data/dataset.json")
+TERMINATION = "termination"  # below the world model, where it had to be learned
 WORLD_MODEL, BEHAVIOUR = Path("models/world_model"), Path("models/behaviour")
 ROLLOUTS, POLICIES = Path("data/rollouts.h5"), Path("models/policy")
 REPORTS, METRICS = Path("reports"), Path("reports/metrics.json")
@@ -65,11 +66,13 @@ def fit_world_model(
         progress: shows a bar.
 
     Returns:
-        Parameters, epoch of the kept weights, and their held-out errors.
+        Parameters, epoch of the kept weights, and their held-out errors; those of the termination head, too, where
+        the data are of a robot whose rule is unknown, and some episode terminates.
     """
     from envtf_lit.training import fit, run_folder
     from envtf_lit.world_models.lit import lit_world_model, window_data
     from envtf_lit.world_models.store import save_world_model
+    from envtf_lit.world_models.termination import learn_termination, save_termination
 
     options = params.train_model
     budget = options.ensemble or options
@@ -94,8 +97,12 @@ def fit_world_model(
         "open_loop_error": best["val/open_loop_error"],
         "val_loss": best["val/loss"],
     }
+    head = learn_termination(data.train, seed=params.seed) if data.dataset.task is None else None
     with replacing(target) as folder:
         save_world_model(folder, lit.kept)
+        if head is not None:
+            save_termination(folder / TERMINATION, head)
+            metrics |= head.scores(data.held_out)
         _record(folder, metrics, key)
         curves.write(folder / "curves.csv")
     return metrics
@@ -138,7 +145,7 @@ def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool 
                 NoisyPolicy(clone.to(device), options.exploration),
                 starts,
                 horizon=options.horizon,
-                terminated=_termination(params),
+                terminated=_termination(params, root, device),
                 novelty_limit=options.novelty_limit,
                 mode=options.mode,
                 generator=generator,
@@ -245,7 +252,8 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         facts: dict[str, Any] = dict(
             seed=params.seed,
             dataset=dataset,
-            world_model=world_model_metrics(report, scale, parameters=sum(p.numel() for p in model.parameters())),
+            world_model=world_model_metrics(report, scale, parameters=sum(p.numel() for p in model.parameters()))
+            | {"termination": _termination_used(params, root)},
             rollouts=len(rollouts),
         )
         with replacing(root / PLOTS) as plots, replacing(root / VIDEO) as video:
@@ -297,7 +305,9 @@ def _give_imagination(agent: Any, params: Params, root: Path, dataset: Any) -> N
     model = load_world_model(root / WORLD_MODEL).to(device)
     temperature = agent.options.return_temperature
     weights = None if temperature is None else return_weights(dataset, temperature)  # as the real rows are drawn
-    imagination = Imagination(model, dataset, _termination(params), agent.options.imagination, device, weights)
+    imagination = Imagination(
+        model, dataset, _termination(params, root, device), agent.options.imagination, device, weights
+    )
     agent.dream_with(imagination, load_rollouts(root / ROLLOUTS), reward_std=float(dataset.rewards.std()))
 
 
@@ -305,10 +315,21 @@ def _robot(params: Params) -> Robot | None:
     return None if params.task is None else get_task(params.task).robot
 
 
-def _termination(params: Params) -> Callable[[torch.Tensor], torch.Tensor]:
-    """The robot's rule; where none is known, imagined rollouts end at their horizon alone."""
-    robot = _robot(params)
-    return never_terminated if robot is None else robot.terminated
+def _termination(params: Params, root: Path, device: torch.device) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The robot's rule, or the learned one; where there is neither, imagined rollouts end at their horizon alone."""
+    from envtf_lit.world_models.termination import load_termination
+
+    robot, folder = _robot(params), root / WORLD_MODEL / TERMINATION
+    if robot is not None:
+        return robot.terminated
+    return load_termination(folder).to(device).terminated if folder.exists() else never_terminated
+
+
+def _termination_used(params: Params, root: Path) -> str:
+    """Where imagined rollouts end: by the robot's `rule`, a `learned` one, or `none`."""
+    if params.task is not None:
+        return "rule"
+    return "learned" if (root / WORLD_MODEL / TERMINATION).exists() else "none"
 
 
 def _unseen(params: Params) -> dict[str, float]:

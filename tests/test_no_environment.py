@@ -148,6 +148,7 @@ def test_metrics_hold_no_score_and_only_finite_numbers(finished: tuple[Path, Par
     assert set(metrics["baselines"]) == {"bc", "cql"}
     assert metrics["held_out"]["episodes"] == 2  # of the three held out, one scales the predicted intervals
     assert metrics["baselines"]["bc"]["action_error"] > 0
+    assert metrics["world_model"]["termination"] == "learned"
     card = json.loads((root / "data/dataset.json").read_text())
     assert card["task"] is None and "scores" not in card
 
@@ -180,7 +181,7 @@ def test_the_report_says_that_nobody_measured_a_return(finished: tuple[Path, Par
     pipeline.report(params, root, progress=False)
     text = said(root / "reports/report.ipynb")
     assert "no simulator here, so nobody knows how any of them does" in text
-    assert "imagined rollouts end at their horizon alone" in text
+    assert "a classifier learned from the log says so" in text
     assert "No video" in text
     assert "D4RL" not in text and "hop" not in text.lower()
 

@@ -1,5 +1,7 @@
 """The twenty tasks and their robots' variants: names, simulators, termination rules."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -41,6 +43,32 @@ def test_the_first_dimensions_of_the_large_ant_are_those_of_the_small_one() -> N
         steps = [env.step(action) for env in (small, large)]
         np.testing.assert_array_equal(steps[0][0], steps[1][0][:27])
         assert steps[0][1] == steps[1][1]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_rules_agree_with_the_simulator_wherever_the_robot_is_put(name: str) -> None:
+    """Far beyond every limit and close to it, on both sides of zero: the published copies miss the latter."""
+    robot, rng = ROBOTS[name], np.random.default_rng(0)
+    env: Any = robot.make().unwrapped
+    env.reset(seed=0)
+    position, fell = env.init_qpos.copy(), list[bool]()
+    for k in range(1_000):
+        env.reset_model()
+        spread = (0.02, 0.3, 1.0, 150.0)[k % 4]
+        moved = position + spread * rng.normal(size=len(position)) * (rng.random(len(position)) < 0.3)
+        env.set_state(moved, rng.normal(size=len(env.init_qvel)))
+        observation = torch.tensor(env._get_obs())
+        fell.append(not getattr(env, "is_healthy", True))
+        assert bool(robot.terminated(observation)) == fell[-1]
+    assert (name == "halfcheetah") == (not any(fell)) and not all(fell)
+
+
+def test_a_coordinate_below_minus_a_hundred_ends_hoppers_episode() -> None:
+    upright = torch.tensor([1.25, *(10 * [0.0])])
+    for value, fell in ((99.0, False), (-99.0, False), (101.0, True), (-101.0, True)):
+        observation = upright.clone()
+        observation[3] = value
+        assert bool(ROBOTS["hopper"].terminated(observation)) is fell
 
 
 @pytest.mark.parametrize(
