@@ -135,10 +135,11 @@ class Publish(Callback):
     """Writes what was trained as a model folder, for `load_world_model` or `load_policy`, beside the run's logs."""
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        state = trainer.strategy.lightning_module_state_dict()  # by all processes: each may hold a part of the weights
+        # by all processes: each may hold a part of the weights
+        state, folder = trainer.strategy.lightning_module_state_dict(), _folder(trainer) / "published"
         if not trainer.is_global_zero:
             return
-        folder, weights = _folder(trainer) / "published", "last update"
+        weights = "last update"
         if (checkpoint := _best(trainer)) is not None:
             state = torch.load(checkpoint.best_model_path, map_location="cpu", weights_only=True)["state_dict"]
             weights = f"epoch of best {checkpoint.monitor}, {checkpoint.best_model_score:.4g}"
@@ -161,13 +162,17 @@ def _best(trainer: L.Trainer) -> ModelCheckpoint | None:
 class KeepConfig(SaveConfigCallback):
     """Writes the whole configuration to `config.yaml` beside the run's logs, wherever the logger keeps them."""
 
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        self.folder = _folder(trainer)
+        super().setup(trainer, pl_module, stage)
+
     def save_config(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        with replacing(_folder(trainer) / "config.yaml") as temporary:
+        with replacing(self.folder / "config.yaml") as temporary:
             self.parser.save(self.config, str(temporary), skip_none=False, multifile=False)
 
 
 def _folder(trainer: L.Trainer) -> Path:
-    """The run's own folder; not every logger has one."""
+    """The run's own folder; not every logger has one. To be asked by all processes: the first tells the others."""
     return Path(trainer.log_dir or trainer.default_root_dir)
 
 
@@ -352,7 +357,11 @@ def _run(kind: str, arguments: list[str]) -> None:
         args=[*_shipped_configs(arguments)],
         seed_everything_default=0,
         auto_configure_optimizers=False,
-        trainer_defaults={"default_root_dir": ".envtf", "callbacks": [Publish()]},
+        trainer_defaults={
+            "default_root_dir": ".envtf",
+            "callbacks": [Publish()],
+            "use_distributed_sampler": False,  # the samplers share draws among processes themselves
+        },
         save_config_callback=KeepConfig,
         save_config_kwargs={"save_to_log_dir": False},
         parser_kwargs={

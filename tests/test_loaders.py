@@ -85,3 +85,14 @@ def test_rows_of_better_episodes_are_drawn_more_often():
     draws = next(iter(DrawSampler(9, (90_000,), 1, seed=0, weights=weights)))
     shares = torch.bincount(draws, minlength=9) / 90_000
     torch.testing.assert_close(shares, (weights / weights.sum()).float(), atol=5e-3, rtol=0)
+
+
+def test_processes_share_the_draws_of_one_with_their_batches_together():
+    whole = list(DrawSampler(1000, (2, 6), 3, seed=0))
+    shares = [list(DrawSampler(1000, (2, 2), 3, seed=0, process=(rank, 3))) for rank in range(3)]
+    for step in range(3):
+        assert torch.equal(torch.cat([share[step] for share in shares], dim=-1), whole[step])
+    weights = torch.linspace(0, 1, 50)
+    one = next(iter(DrawSampler(50, (4,), 1, seed=0, weights=weights)))
+    second = next(iter(DrawSampler(50, (2,), 1, seed=0, weights=weights, process=(1, 2))))
+    assert torch.equal(second, one[2:])

@@ -51,12 +51,23 @@ class DrawSampler(Sampler[Tensor]):
         batches: draws per epoch.
         seed: with the epoch, names the random stream.
         weights: (rows,) chances of each row, up to a factor; None draws uniformly.
+        process: which one this is, of how many. All draw the same numbers, of a shape whose last axis is so many times
+            as long, and each takes its own share of that axis.
     """
 
     def __init__(
-        self, rows: int, shape: tuple[int, ...], batches: int, *, seed: int, weights: Tensor | None = None
+        self,
+        rows: int,
+        shape: tuple[int, ...],
+        batches: int,
+        *,
+        seed: int,
+        weights: Tensor | None = None,
+        process: tuple[int, int] = (0, 1),
     ) -> None:
-        self.rows, self.shape, self.batches, self.seed, self.epoch = rows, shape, batches, seed, 0
+        rank, world = process
+        self.rows, self.batches, self.seed, self.epoch = rows, batches, seed, 0
+        self.shape, self.share = (*shape[:-1], world * shape[-1]), slice(rank * shape[-1], (rank + 1) * shape[-1])
         self.weighted = None if weights is None else WeightedRows(weights)
 
     def set_epoch(self, epoch: int) -> None:
@@ -70,9 +81,10 @@ class DrawSampler(Sampler[Tensor]):
         generator = epoch_generator(self.seed, self.epoch, "rows")
         for _ in range(self.batches):
             if self.weighted is None:
-                yield torch.randint(self.rows, self.shape, generator=generator)
+                drawn = torch.randint(self.rows, self.shape, generator=generator)
             else:
-                yield self.weighted.draw(self.shape, generator)
+                drawn = self.weighted.draw(self.shape, generator)
+            yield drawn[..., self.share]
 
 
 def return_weights(dataset: OfflineDataset, temperature: float) -> Tensor:
@@ -231,13 +243,18 @@ def _device(data: L.LightningDataModule) -> torch.device:
     return torch.device("cpu") if data.trainer is None else data.trainer.strategy.root_device
 
 
+def _process(data: L.LightningDataModule) -> tuple[int, int]:
+    """Which of how many processes this one is."""
+    return (0, 1) if data.trainer is None else (data.trainer.global_rank, data.trainer.world_size)
+
+
 class WindowData(L.LightningDataModule):
     """Windows for world models, with whole episodes held out for validation.
 
     Args:
         path: dataset file, HDF5 or NPZ.
         context: steps per window; the model's context.
-        batch_size: windows per batch.
+        batch_size: windows per batch and process.
         updates_per_epoch: batches per epoch.
         held_out: share of the episodes kept for validation.
         seed: of the split and of all draws.
@@ -276,11 +293,11 @@ class WindowData(L.LightningDataModule):
         """Batches (B, T, …) of `Windows`, or (M, B, T, …) of `Resamples`."""
         windows = Windows(self.train, self.context, _device(self))
         shape = (self.batch_size,) if self.members is None else (self.members, self.batch_size)
-        sampler = DrawSampler(len(windows), shape, self.updates_per_epoch, seed=self.seed)
+        sampler = DrawSampler(len(windows), shape, self.updates_per_epoch, seed=self.seed, process=_process(self))
         return _loader(windows if self.members is None else Resamples(windows, self.members, seed=self.seed), sampler)
 
     def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """Each held-out row once."""
+        """Each held-out row once; of several processes, every one sees them all."""
         windows = Windows(self.held_out, self.context, _device(self))
         return _loader(windows, windows.tiles().split(256))
 
@@ -302,7 +319,7 @@ class TransitionData(L.LightningDataModule):
 
     Args:
         path: dataset file, HDF5 or NPZ.
-        batch_size: rows per gradient step.
+        batch_size: rows per gradient step and process.
         updates_per_step: gradient steps per Lightning training step; a batch has shape (updates_per_step, batch_size).
         steps_per_epoch: Lightning training steps per epoch.
         discount: of future rewards, per step.
@@ -347,7 +364,8 @@ class TransitionData(L.LightningDataModule):
         shape = (self.updates_per_step, self.batch_size)
         temperature = self.return_temperature
         weights = None if temperature is None else return_weights(self.dataset, temperature)
-        sampler = DrawSampler(len(self.transitions), shape, self.steps_per_epoch, seed=self.seed, weights=weights)
+        rows, process = len(self.transitions), _process(self)
+        sampler = DrawSampler(rows, shape, self.steps_per_epoch, seed=self.seed, weights=weights, process=process)
         return _loader(self.transitions, sampler)
 
     def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:

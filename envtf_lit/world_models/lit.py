@@ -135,30 +135,41 @@ class LitWorldModel(L.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         # one stream per epoch, for dropout as for sampling: a resumed run draws what an uninterrupted one would have
-        torch.manual_seed(epoch_generator(self.seed, self.current_epoch, "model").initial_seed())
+        stream = f"model{self.global_rank or ''}"
+        torch.manual_seed(epoch_generator(self.seed, self.current_epoch, stream).initial_seed())
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
-        loss = self.model.loss(batch)
-        self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch["mask"]))
+        loss = self.model.loss(batch) * self._share(batch["mask"])
+        self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch["mask"]), sync_dist=True)
         return loss
 
-    def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
-        self.log("val/loss", self.model.loss(batch), batch_size=int(batch["mask"].sum()))
+    def _share(self, mask: Tensor) -> Tensor | float:
+        """What makes the mean over processes, of means over their own tokens, the mean over all tokens."""
+        if self.trainer.world_size == 1:
+            return 1.0
+        tokens = mask.sum()
+        return tokens / self.trainer.strategy.reduce(tokens.clone(), reduce_op="mean")
 
-    def on_validation_epoch_end(self) -> None:
-        error = open_loop_error(self.kept, self.segments, self.scale)
-        self.log("val/open_loop_error", error, prog_bar=True)
+    def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
+        self._judge("val", batch, batch_index)
 
     def test_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
-        self.log("test/loss", self.kept.loss(batch), batch_size=int(batch["mask"].sum()))
+        self._judge("test", batch, batch_index)
 
-    def on_test_epoch_end(self) -> None:
-        self.log("test/open_loop_error", open_loop_error(self.kept, self.segments, self.scale))
+    def _judge(self, split: str, batch: dict[str, Tensor], batch_index: int) -> None:
+        """Logs the batch's loss, and once the open-loop error: in a step, where a model spread over GPUs is whole."""
+        tokens = int(batch["mask"].sum())
+        self.log(f"{split}/loss", self.kept.loss(batch), batch_size=tokens, sync_dist=True)
+        if batch_index == 0:
+            with torch.autocast(self.device.type, enabled=False):  # as the saved model is judged
+                error = open_loop_error(self.kept, self.segments, self.scale)
+            self.log(f"{split}/open_loop_error", error, prog_bar=split == "val", batch_size=1, sync_dist=True)
 
     def configure_optimizers(self) -> dict[str, Any]:
         o = self.options
-        matrices = [p for p in self.model.parameters() if p.dim() >= 2]
-        vectors = [p for p in self.model.parameters() if p.dim() < 2]
+        matrices, vectors = [], []
+        for name, parameter in self.model.named_parameters():  # by name: spread over GPUs, all of them are flat
+            (matrices if name.endswith("weight") and "norm" not in name else vectors).append(parameter)
         optimizer = torch.optim.AdamW(
             [dict(params=matrices, weight_decay=o.weight_decay), dict(params=vectors, weight_decay=0.0)],
             lr=o.learning_rate,
@@ -252,7 +263,7 @@ class LitEnsemble(LitWorldModel):
         if self.trainer.state.fn == "fit":
             self._keep_the_best(error)
             self._stop_when_stale()
-        super().on_validation_epoch_end()
+        self.log("val/open_loop_error", open_loop_error(self.kept, self.segments, self.scale), prog_bar=True)
 
     def _keep_the_best(self, error: Tensor) -> None:
         """Takes over the members that improved, given the held-out errors of all (M,)."""
