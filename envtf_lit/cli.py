@@ -185,6 +185,9 @@ def _add_horizon(commands: Any) -> None:
         "--online", type=_natural, default=100, metavar="N", help="fresh episodes of each online policy; 100"
     )
     horizon.add_argument(
+        "--start", type=_natural, default=0, metavar="N", help="steps of each episode to leave out; default: 0"
+    )
+    horizon.add_argument(
         "--model",
         action="append",
         default=[],
@@ -410,7 +413,7 @@ def _horizon(namespace: argparse.Namespace, rest: list[str]) -> None:
         tier=namespace.tier,
         work=namespace.work,
         options=_suite_options(namespace),
-        measured=HorizonOptions(namespace.trajectories, namespace.online),
+        measured=HorizonOptions(namespace.trajectories, namespace.online, namespace.start),
         others=dict(_named_folder(text) for text in namespace.model),
         progress=not namespace.quiet,
         report=Console(highlight=False, markup=False, soft_wrap=True).print,

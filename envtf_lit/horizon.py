@@ -39,10 +39,12 @@ class HorizonOptions:
     Attributes:
         trajectories: fresh episodes of the tier's behaviour policies, from their first step.
         online: fresh episodes of each of the three online policies.
+        start: steps of each episode that are left out, and with them the episodes that end before.
     """
 
     trajectories: int = 300
     online: int = 100
+    start: int = 0
 
 
 def compare(
@@ -155,12 +157,13 @@ class _Course:
     """
 
     def __init__(self, task: Task, suite: Suite, home: Path, measured: HorizonOptions, progress: bool) -> None:
-        self.robot, self.home, self.seed, self.dataset = task.robot, home, suite.options.seed, suite.dataset
+        self.robot, self.home, self.dataset = task.robot, home, suite.dataset
+        self.seed, self.start = suite.options.seed, measured.start
         self.device = pick_device()
         self.key = flat_settings(task.tier, suite.options, measured=measured)
         wanted = {RECORDED: (task, measured.trajectories)}
         wanted |= {name: (Task(task.robot, name), measured.online) for name in ONLINE}
-        folder = run_folder(home, "episodes", self.key, [])
+        folder = run_folder(home, "episodes", self.key | {"measured.start": 0}, [])  # the same from every start
         self.trajectories = {
             source: self._fresh(folder / f"{source}.h5", *ask, workers=suite.options.threads, progress=progress)
             for source, ask in wanted.items()
@@ -171,7 +174,12 @@ class _Course:
         if not file.exists():
             seed = self.seed + SEED_OFFSET
             save_dataset(fresh_episodes(task, count, seed=seed, workers=workers, progress=progress), file)
-        return whole_episodes(load_dataset(file), count, seed=self.seed).to(self.device)
+        found = whole_episodes(load_dataset(file), count, seed=self.seed).later(self.start)
+        if len(found.lengths) == 0:
+            raise UserError(
+                f"No episode of {task.name} lasts longer than {self.start} steps: start earlier, or take more episodes."
+            )
+        return found.to(self.device)
 
     @property
     def episodes(self) -> str:

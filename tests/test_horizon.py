@@ -34,7 +34,8 @@ def short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def run(folder: Path, lines: list[str], **options: Any) -> dict[str, Any]:
     facts: dict[str, Any] = dict(robots=["hopper"], tier="medium", work=folder / "work", options=TINY, progress=False)
-    return compare(folder / "out/horizon.json", measured=HorizonOptions(6, 3), report=lines.append, **facts | options)
+    facts |= dict(measured=HorizonOptions(6, 3), report=lines.append)
+    return compare(folder / "out/horizon.json", **facts | options)
 
 
 @pytest.mark.usefixtures("short_episodes")
@@ -61,6 +62,8 @@ def test_every_model_is_measured_once_and_all_of_it_is_written(tmp_path: Path) -
         drawn = pd.read_csv(tmp_path / f"out/horizon/{name}.csv")
         assert set(MODELS) <= set(drawn["model"])
 
+    with pytest.raises(UserError, match="No episode of hopper-medium lasts longer than 12 steps"):
+        run(tmp_path, lines, measured=HorizonOptions(6, 3, start=12))
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "work").rglob("*") if path.is_file()}
     other = {"mine": str(tmp_path / "work/{task}/models/ensemble")}
     again = run(tmp_path, lines, others=other)

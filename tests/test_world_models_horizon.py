@@ -160,3 +160,16 @@ def test_whole_episodes_start_at_the_first_step():
     starts = torch.from_numpy(data.observations[data.episode_starts])
     assert len(chosen.lengths) == 2
     assert all((row == starts).all(-1).any() for row in chosen.observations[:, 0])
+
+
+def test_later_trajectories_begin_where_they_are_told_to():
+    data = linear_data((5, 30, 3, 8))
+    whole = whole_episodes(data, 4, seed=0)
+    later = whole.later(5)
+    assert later.lengths.tolist() == [25, 3]
+    for row, episode in enumerate((1, 3)):
+        rows = slice(data.episode_starts[episode] + 5, data.episode_ends[episode])
+        np.testing.assert_array_equal(later.observations[row, : later.lengths[row]], data.observations[rows])
+        np.testing.assert_array_equal(later.targets[row, : later.lengths[row], :-1], data.next_observations[rows])
+        np.testing.assert_array_equal(later.actions[row, : later.lengths[row]], data.actions[rows])
+    assert torch.equal(whole.later(0).observations, whole.observations)

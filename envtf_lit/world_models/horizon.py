@@ -70,6 +70,12 @@ class Trajectories:
         """(B, T) bool, False in the padding."""
         return torch.arange(self.actions.shape[1], device=self.lengths.device) < self.lengths[:, None]
 
+    def later(self, start: int) -> "Trajectories":
+        """Those that last longer than `start` steps, without their first `start`."""
+        rows = self.lengths > start
+        columns = (self.observations, self.actions, self.targets)
+        return Trajectories(*(column[rows, start:] for column in columns), lengths=self.lengths[rows] - start)
+
     def to(self, device: torch.device | str) -> "Trajectories":
         """The same on another device."""
         columns = (self.observations, self.actions, self.targets, self.lengths)
