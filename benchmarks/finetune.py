@@ -10,6 +10,7 @@ through `envtf model fit`, as a user's would; what lies in the work folder from 
 import argparse
 import json
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -31,13 +32,14 @@ def dataset(task: str, rows: int, work: Path, options: argparse.Namespace) -> Pa
     return path
 
 
-def fit(run: Path, path: Path, updates: int, options: argparse.Namespace, *flags: str) -> pd.Series:
-    """Trains one model into `run`; held-out error by updates."""
+def fit(run: Path, path: Path, updates: int, every: int, options: argparse.Namespace, *flags: str) -> pd.Series:
+    """Trains one model into `run`, with a look at the held-out error every so many updates; that error by updates."""
     if not (run / "published").exists():
+        shutil.rmtree(run, ignore_errors=True)  # of a call that was interrupted
         flags_of_all = {
             "data.path": path,
             "model.options.updates": updates,
-            "model.options.updates_per_epoch": options.every,
+            "model.options.updates_per_epoch": every,
             "model.seed": options.seed,
             "seed_everything": options.seed,
             "trainer.precision": "bf16-mixed",
@@ -72,14 +74,16 @@ def main() -> None:
     work = options.work / f"seed-{options.seed}"
 
     base_data, data = dataset(BASE, options.base_rows, work, options), dataset(TARGET, options.rows, work, options)
-    fit(work / f"base-{options.base_updates}", base_data, options.base_updates, options)
+    fit(work / f"base-{options.base_updates}", base_data, options.base_updates, options.base_updates // 4, options)
     base = work / f"base-{options.base_updates}" / "published"
-    scratch = fit(work / f"scratch-{options.updates}", data, options.updates, options)
+    scratch = fit(work / f"scratch-{options.updates}", data, options.updates, options.every, options)
     updates = options.tuned_updates or options.updates // 4
     flags = {"init_from": base, "freeze": options.freeze, "options.learning_rate": options.learning_rate}
     parts = "-".join(options.freeze.strip("[]").replace(" ", "").split(","))
     run = work / f"tuned-{updates}-{options.learning_rate:g}-{parts}"
-    tuned = fit(run, data, updates, options, *(f"--model.{name}={value}" for name, value in flags.items()))
+    tuned = fit(
+        run, data, updates, options.every, options, *(f"--model.{name}={value}" for name, value in flags.items())
+    )
 
     target = float(scratch.min())
     reached = tuned.index[tuned <= target]
