@@ -24,7 +24,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.params import PolicyOptions, TrainModelOptions
 from envtf_lit.policy import save_policy
 from envtf_lit.storage import read_json, replacing
-from envtf_lit.world_models.lit import LitWorldModel, lit_world_model, window_options
+from envtf_lit.world_models.lit import LitEnsemble, LitWorldModel, lit_world_model, window_options
 from envtf_lit.world_models.store import save_world_model
 
 CONFIGS = Path(__file__).parent / "configs"
@@ -139,7 +139,7 @@ class Publish(Callback):
         state, folder = trainer.strategy.lightning_module_state_dict(), _folder(trainer) / "published"
         if not trainer.is_global_zero:
             return
-        weights = "last update"
+        weights = "members at their best" if isinstance(pl_module, LitEnsemble) else "last update"
         if (checkpoint := _best(trainer)) is not None:
             state = torch.load(checkpoint.best_model_path, map_location="cpu", weights_only=True)["state_dict"]
             weights = f"epoch of best {checkpoint.monitor}, {checkpoint.best_model_score:.4g}"

@@ -121,9 +121,12 @@ def test_agent_fit_publishes_a_policy_with_the_datas_scale_and_limits(
     assert all(torch.equal(saved["state_dict"][f"average_actor.{k}"], v) for k, v in policy.state_dict().items())
 
 
-def test_model_fit_trains_the_ensemble_where_its_options_stand(folder: Path) -> None:
+def test_model_fit_trains_the_ensemble_where_its_options_stand(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     sizes = {"members": 3, "elites": 2, "hidden": [8], "weight_decay": [0, 0], "updates": 4, "updates_per_epoch": 2}
     fit("model", ensemble=json.dumps(sizes))
+    assert "weights of the members at their best: .envtf/published" in capsys.readouterr().out
     model = load_world_model(".envtf/published")
     assert isinstance(model, EnsembleDynamics) and model.members == 3 and len(model.elite) == 2
     (checkpoint,) = Path(".envtf").rglob("*.ckpt")
