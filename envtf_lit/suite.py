@@ -188,8 +188,8 @@ def _unless_done(record: Path, settings: dict[str, Any], work: Callable[[], obje
     begin = time.perf_counter()
     work()
     seconds = time.perf_counter() - begin
-    write_json(record, {"settings": settings, "seconds": round(seconds, 1)})
-    return round(seconds, 1)
+    write_json(record, {"settings": settings, "seconds": round(seconds, 3)})
+    return round(seconds, 3)
 
 
 def _over(defaults: Any, given: Any) -> Any:
