@@ -49,7 +49,7 @@ def tidy_curves(runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 
 
 def learning_curves(runs: Mapping[str, pd.DataFrame], path: str | Path, *, title: str) -> Path:
-    """One panel per logged quantity, one line per run; validation is dashed.
+    """One panel per quantity that was logged more than once, one line per run; validation is dashed.
 
     Args:
         runs: name of the run (`cql`, `et_cql`, `world_model`) to its curves.csv.
@@ -59,7 +59,8 @@ def learning_curves(runs: Mapping[str, pd.DataFrame], path: str | Path, *, title
     table = tidy_curves(runs)
     order = list(TITLES)
     known = sorted(table["quantity"].unique(), key=lambda name: order.index(name) if name in TITLES else len(order))
-    quantities = known[:MOST_PANELS]
+    curves = [name for name in known if table.loc[table["quantity"] == name, "at"].nunique() > 1]
+    quantities = (curves or known)[:MOST_PANELS]  # one point is no curve, and stays in the CSV
     columns = min(3, len(quantities))
     rows = math.ceil(len(quantities) / columns)
     with drawing(path, (4.2 * columns, 2.9 * rows + 0.6), rows, columns) as (figure, axes):
