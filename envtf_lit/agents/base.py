@@ -188,11 +188,13 @@ class OfflineAgent(L.LightningModule, ABC):
     def update(self, batch: Batch) -> dict[str, Tensor]:
         """One gradient step of every part; returns detached scalars to log."""
         batch = batch | {name: batch[name] / self.return_scale for name in ("rewards", "returns")}
+        batch["real"] = torch.ones_like(batch["rewards"])
         if self.update_index < self.options.warm_start:
             return self.warm_up(batch)
-        gradient = self.value_gradient
-        if gradient is not None and self.update_index >= self.options.updates - gradient.options.updates:
-            return self.climb(batch, gradient)
+        if (gradient := self.value_gradient) is not None:
+            climbed = self.update_index - (self.options.updates - gradient.options.updates)
+            if climbed >= 0:
+                return self.climb(batch, gradient, climbed)
         batch = self.mix(batch)
         actor_optimizer, critic_optimizer, alpha_optimizer, *_ = self._optimizers()
         critic_loss, logs = self.critic_loss(batch, self.generator)
@@ -207,17 +209,15 @@ class OfflineAgent(L.LightningModule, ABC):
 
     def warm_up(self, batch: Batch) -> dict[str, Tensor]:
         """Critics regress on Monte-Carlo returns of the log; the actor clones it, unless it began from `init_from`."""
-        actor_optimizer, critic_optimizer, *_ = self._optimizers()
+        actor_optimizer, critic_optimizer, *others = self._optimizers()
         q = self.critics(batch["observations"], batch["actions"])
         critic_loss = 0.5 * (q - batch["returns"]).square().mean(1).sum()
         _descend(self, critic_optimizer, critic_loss)
-        clone_loss = self.clone_loss(batch | {"real": torch.ones_like(batch["rewards"])})
+        clone_loss = self.clone_loss(batch)
         if self.clones:
             _descend(self, actor_optimizer, clone_loss)
         if self.value_gradient is not None:
-            _descend(
-                self, self._optimizers()[4], self.value_gradient.value_loss(batch["observations"], batch["returns"])
-            )
+            _descend(self, others[-1], self.value_gradient.value_loss(batch["observations"], batch["returns"]))
         if self.update_index == self.options.warm_start - 1:
             self.target_critics.load_state_dict(self.critics.state_dict())
             self.average_actor.load_state_dict(self.actor.state_dict())
@@ -230,13 +230,14 @@ class OfflineAgent(L.LightningModule, ABC):
         log_density = self.actor.log_prob(batch["observations"], batch["actions"])
         return -(batch["real"] * log_density).sum() / batch["real"].sum()
 
-    def climb(self, batch: Batch, gradient: ValueGradient) -> dict[str, Tensor]:
+    def climb(self, batch: Batch, gradient: ValueGradient, done: int) -> dict[str, Tensor]:
         """One update of the actor along the gradient of imagined returns, kept near the real rows' actions.
 
-        It begins at the averaged actor. The state value then learns from the same paths.
+        It begins at the averaged actor. The state value then learns from the same paths. `done` counts the updates
+        before this one.
         """
         assert self.imagination is not None
-        options, done = gradient.options, self.update_index - (self.options.updates - gradient.options.updates)
+        options = gradient.options
         if done == 0:
             self.actor.load_state_dict(self.average_actor.state_dict())
         *_, actor_optimizer, value_optimizer = self._optimizers()
@@ -245,7 +246,7 @@ class OfflineAgent(L.LightningModule, ABC):
             paths = gradient.paths(self.actor, self.imagination, self.return_scale, self.generator)
             gradient.value.requires_grad_(False)
             imagined = gradient.imagined_return(paths, self.options.discount).mean()
-            clone_loss = self.clone_loss(batch | {"real": torch.ones_like(batch["rewards"])})
+            clone_loss = self.clone_loss(batch)
             _descend(self, actor_optimizer, options.clone_weight * clone_loss - imagined, clip=1.0)
             gradient.value.requires_grad_(True)
             for observations, targets in gradient.lessons(paths, self.options.discount, self.generator):
@@ -256,7 +257,7 @@ class OfflineAgent(L.LightningModule, ABC):
         return dict(imagined_value=imagined * self.return_scale, value_loss=value_loss, clone_loss=clone_loss)
 
     def _optimizers(self) -> list[Any]:
-        """The optimisers; those of actor, critics and alpha at the learning rates of the current update."""
+        """As `configure_optimizers` lists them; actor's, critics' and alpha's at the current update's rates."""
         optimizers: list[Any] = self.optimizers()  # pyright: ignore[reportAssignmentType]
         for optimizer, rate in zip(optimizers, self._rates(), strict=False):
             optimizer.param_groups[0]["lr"] = rate
@@ -275,17 +276,14 @@ class OfflineAgent(L.LightningModule, ABC):
     def mix(self, batch: Batch) -> Batch:
         """Replaces the last rows of a real batch by imagined ones; `real` (B,) marks what is real."""
         imagination = self.options.imagination
-        total = len(batch["rewards"])
-        real = torch.ones(total, device=self.device)
         if imagination is None or self.ring is None:
-            return batch | {"real": real}
+            return batch
         if self.imagination is not None and self._refresh_now(imagination):
             self.remember(self.imagination.rollouts(self.actor, self.generator))
-        number = total - round(imagination.real_ratio * total)
-        imagined = self.ring.draw(number, self.generator)
-        real[total - number :] = 0.0
-        names = ("observations", "actions", "rewards", "next_observations", "discounts")
-        return {name: torch.cat([batch[name][: total - number], imagined[name]]) for name in names} | {"real": real}
+        kept = round(imagination.real_ratio * len(batch["real"]))
+        imagined = self.ring.draw(len(batch["real"]) - kept, self.generator)
+        imagined["real"] = torch.zeros_like(imagined["rewards"])
+        return {name: torch.cat([batch[name][:kept], column]) for name, column in imagined.items()}
 
     def remember(self, rollouts: Rollouts) -> None:
         """Puts rollouts into the ring, rewards less the penalty `weight * std(r) * u`."""
