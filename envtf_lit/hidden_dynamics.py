@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
@@ -40,6 +39,8 @@ class HiddenDynamics(gymnasium.Wrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: gymnasium.Env) -> None:
+        import mujoco  # late, as in `Robot.make`: importing it costs, and fails where MUJOCO_GL names what is missing
+
         RecordConstructorArgs.__init__(self)  # so that Minari recovers this environment, not the nominal one
         gymnasium.Wrapper.__init__(self, env)
         self.factors = Factors()
@@ -64,6 +65,8 @@ class HiddenDynamics(gymnasium.Wrapper, RecordConstructorArgs):
 
     def apply(self, factors: Factors) -> None:
         """Makes the simulation this multiple of the nominal one, from the present state on."""
+        import mujoco
+
         self.factors = factors
         scales = (factors.friction, factors.mass, factors.mass, factors.strength)
         for (name, values), scale in zip(self._nominal.items(), scales, strict=True):
