@@ -319,10 +319,13 @@ def _termination(params: Params, root: Path, device: torch.device) -> Callable[[
     """The robot's rule, or the learned one; where there is neither, imagined rollouts end at their horizon alone."""
     from envtf_lit.world_models.termination import load_termination
 
-    robot, folder = _robot(params), root / WORLD_MODEL / TERMINATION
-    if robot is not None:
-        return robot.terminated
-    return load_termination(folder).to(device).terminated if folder.exists() else never_terminated
+    match _termination_used(params, root):
+        case "rule":
+            return get_task(str(params.task)).robot.terminated
+        case "learned":
+            return load_termination(root / WORLD_MODEL / TERMINATION).to(device).terminated
+        case _:
+            return never_terminated
 
 
 def _termination_used(params: Params, root: Path) -> str:
