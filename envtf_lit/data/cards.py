@@ -25,8 +25,7 @@ def cut_short(dataset: OfflineDataset, source: str) -> np.ndarray:
     """
     if dataset.task is None or source in UNLIMITED:
         return np.zeros(len(dataset.episode_starts), bool)
-    limit = get_task(dataset.task).robot.max_episode_steps
-    return ~dataset.terminated[dataset.episode_ends - 1] & (dataset.episode_lengths < limit)
+    return ~dataset.finished(get_task(dataset.task).robot.max_episode_steps)
 
 
 def counted_episodes(dataset: OfflineDataset, source: str) -> np.ndarray:

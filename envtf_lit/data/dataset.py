@@ -76,6 +76,10 @@ class OfflineDataset:
         """(N,) the episode each row belongs to."""
         return np.repeat(np.arange(len(self.episode_starts)), self.episode_lengths)
 
+    def finished(self, limit: int) -> np.ndarray:
+        """(E,) bool, the episodes that terminated or came to a limit of so many steps: others are cut short."""
+        return self.terminated[self.episode_ends - 1] | (self.episode_lengths >= limit)
+
     def observation_scale(self, floor: float = 1e-3) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation (S,) float32 for a policy's inputs; the std is at least `floor`."""
         mean, std = moments(torch.as_tensor(self.observations[block]) for block in column_blocks(self.observations))

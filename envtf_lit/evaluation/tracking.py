@@ -46,8 +46,7 @@ def fresh_episodes(task: Task, count: int, *, seed: int, workers: int = 1, progr
     limit, rows = task.robot.max_episode_steps, PROBE
     while True:
         dataset = collect(task, rows, seed=seed, workers=workers, progress=progress)
-        ends, lengths = dataset.episode_ends - 1, dataset.episode_lengths
-        whole = np.flatnonzero(dataset.terminated[ends] | (lengths == limit))
+        whole = np.flatnonzero(dataset.finished(limit))
         if len(whole) >= count:
             return dataset.select(np.sort(np.random.default_rng(seed).permutation(whole)[:count]))
         typical = min(rows / max(len(whole), 1), limit)  # rows for each
