@@ -26,10 +26,9 @@ from envtf_lit.evaluation.calibration import (
 from envtf_lit.evaluation.physics import Physics
 from envtf_lit.evaluation.returns import SEED_OFFSET
 from envtf_lit.figures.calibration import calibration_page
-from envtf_lit.storage import pick_device, read_json, write_json, write_text
-from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite, flat_settings
+from envtf_lit.storage import pick_device, write_json, write_text
+from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite, flat_settings, kept
 from envtf_lit.tasks import Task, get_task
-from envtf_lit.training import run_folder
 from envtf_lit.world_models.horizon import Scale, forecast, whole_episodes
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.store import load_world_model
@@ -122,15 +121,15 @@ def compare(
 
 def _kept(task: Task, suite: Suite, home: Path, options: CalibrationOptions, progress: bool) -> Findings:
     """A robot's findings, now or when they were measured of the same models."""
-    key = flat_settings(task.tier, suite.options, calibration=options)
-    inputs = [suite.dataset, *suite.folders.values()]
-    place = run_folder(home, "calibration", key, inputs).with_suffix(".json")
-    if not place.exists():
+
+    def timed() -> dict[str, Any]:
         begin = time.perf_counter()
         findings = measure(task, suite, options, progress=progress)
         findings.numbers["seconds"] = round(time.perf_counter() - begin, 1)
-        write_json(place, asdict(findings))
-    return Findings(**read_json(place))
+        return asdict(findings)
+
+    settings = flat_settings(task.tier, suite.options, calibration=options)
+    return Findings(**kept(home, "calibration", settings, [suite.dataset, *suite.folders.values()], timed))
 
 
 def measure(task: Task, suite: Suite, options: CalibrationOptions, *, progress: bool = True) -> Findings:

@@ -17,8 +17,8 @@ from envtf_lit.evaluation.physics import Physics, ceiling
 from envtf_lit.evaluation.returns import SEED_OFFSET
 from envtf_lit.evaluation.tracking import Tracking, fresh_episodes, track, track_ceiling, track_sampled
 from envtf_lit.figures import horizons
-from envtf_lit.storage import pick_device, read_json, write_json, write_text
-from envtf_lit.suite import MODELS, WORK, Suite, SuiteOptions, build_suite, flat_settings
+from envtf_lit.storage import pick_device, write_json, write_text
+from envtf_lit.suite import MODELS, WORK, Suite, SuiteOptions, build_suite, flat_settings, kept
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.training import run_folder
 from envtf_lit.world_models.horizon import THRESHOLDS, Scale, Trajectories, whole_episodes
@@ -211,10 +211,12 @@ class _Course:
 
     def _kept(self, name: str, inputs: list[Path], work: Callable[[], dict[str, Tracking]]) -> dict[str, Tracking]:
         """Results of the work, now or when it was done on the same inputs."""
-        place = run_folder(self.home, f"horizon-{name}", self.key, [self.dataset, *inputs]).with_suffix(".json")
-        if not place.exists():
-            write_json(place, {source: asdict(tracking) for source, tracking in work().items()})
-        return {source: Tracking(**content) for source, content in read_json(place).items()}
+
+        def plain() -> dict[str, Any]:
+            return {source: asdict(tracking) for source, tracking in work().items()}
+
+        found = kept(self.home, f"horizon-{name}", self.key, [self.dataset, *inputs], plain)
+        return {source: Tracking(**content) for source, content in found.items()}
 
 
 def flat_numbers(found: Mapping[str, Results]) -> dict[str, float]:

@@ -23,6 +23,7 @@ from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.params import DownloadOptions, EnsembleOptions, ModelOptions, Params, Precision, TrainModelOptions
 from envtf_lit.storage import read_json, write_json
 from envtf_lit.tasks import Robot, get_task
+from envtf_lit.training import run_folder
 from envtf_lit.validation import check_ranges, check_world_model
 from envtf_lit.world_models.recalibration import calibration_split
 
@@ -94,6 +95,22 @@ def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str
         **{f"{prefix}.{name}": value for prefix, what in measured.items() for name, value in asdict(what).items()},
         **{f"versions.{name}": version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")},
     }
+
+
+def kept(home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path], measure: Callable[[], Any]) -> Any:
+    """What a measurement gives, as JSON has it: now, or when it was made with these settings on the same inputs.
+
+    Args:
+        home: folder below which it is kept.
+        name: of the measurement.
+        settings: as `flat_settings` has them.
+        inputs: files and folders whose bytes count.
+        measure: makes it.
+    """
+    place = run_folder(home, name, settings, inputs).with_suffix(".json")
+    if not place.exists():
+        write_json(place, measure())
+    return read_json(place)
 
 
 def build_suite(
