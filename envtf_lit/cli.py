@@ -383,58 +383,42 @@ def _zoo_list(namespace: argparse.Namespace, rest: list[str]) -> None:
     Console().print(table)
 
 
-def _hidden(namespace: argparse.Namespace, rest: list[str]) -> None:
+def _comparison(namespace: argparse.Namespace) -> dict[str, Any]:
+    """What every comparison of the suite's models is asked for."""
     from rich.console import Console
 
-    from envtf_lit.hidden import compare
-
     _hush_lightning()
-    compare(
-        namespace.out,
+    return dict(
+        out=namespace.out,
         robots=namespace.robots,
         tier=namespace.tier,
         work=namespace.work,
         options=_suite_options(namespace),
-        unseen=namespace.unseen,
         progress=not namespace.quiet,
         report=Console(highlight=False, markup=False, soft_wrap=True).print,
     )
 
 
-def _horizon(namespace: argparse.Namespace, rest: list[str]) -> None:
-    from rich.console import Console
+def _hidden(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from envtf_lit.hidden import compare
 
+    compare(**_comparison(namespace), unseen=namespace.unseen)
+
+
+def _horizon(namespace: argparse.Namespace, rest: list[str]) -> None:
     from envtf_lit.horizon import HorizonOptions, compare
 
-    _hush_lightning()
     compare(
-        namespace.out,
-        robots=namespace.robots,
-        tier=namespace.tier,
-        work=namespace.work,
-        options=_suite_options(namespace),
+        **_comparison(namespace),
         measured=HorizonOptions(namespace.trajectories, namespace.online, namespace.start),
         others=dict(_named_folder(text) for text in namespace.model),
-        progress=not namespace.quiet,
-        report=Console(highlight=False, markup=False, soft_wrap=True).print,
     )
 
 
 def _calibrate(namespace: argparse.Namespace, rest: list[str]) -> None:
-    from rich.console import Console
-
     from envtf_lit.calibration import compare
 
-    _hush_lightning()
-    compare(
-        namespace.out,
-        robots=namespace.robots,
-        tier=namespace.tier,
-        work=namespace.work,
-        options=_suite_options(namespace),
-        progress=not namespace.quiet,
-        report=Console(highlight=False, markup=False, soft_wrap=True).print,
-    )
+    compare(**_comparison(namespace))
 
 
 def _named_folder(text: str) -> tuple[str, str]:
