@@ -1,5 +1,6 @@
 """Trains behaviour policies for the zoo with sbx (the extra `behaviour`), and keeps their weights along the way."""
 
+import math
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,12 +11,12 @@ import torch
 from rich.progress import MofNCompleteColumn, TextColumn
 from safetensors.torch import save
 
-from envtf_lit.data.behaviour import Snapshot
+from envtf_lit.data.behaviour import Snapshot, load_snapshot, read_series
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.returns import evaluate_policy
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.progress import progress_bar
-from envtf_lit.storage import replacing, write_json
+from envtf_lit.storage import read_json, replacing, write_json
 from envtf_lit.tasks import Robot
 
 EPISODES = 20  # of deterministic actions, by which a snapshot is measured
@@ -23,6 +24,7 @@ WARM_UP_STEPS = 5_000  # uniform random actions
 ARCHITECTURE = {"hidden": [128, 128], "log_std_min": -20.0}
 # snapshots lie closer where returns climb fast: (up to this step, every so many)
 SCHEDULE = ((1, WARM_UP_STEPS + 2_500), (25_000, 2_500), (50_000, 5_000), (100_000, 10_000), (float("inf"), 25_000))
+SETTLED = "the last snapshot is the mean"
 RENORM_EPSILON = 0.001  # of sbx's BatchRenorm
 
 
@@ -179,6 +181,47 @@ def _keep(actor: TanhGaussianActor, robot: Robot, steps: int, folder: Path) -> S
         round(float(measured.returns.std()), 3),
         round(float(measured.lengths.mean()), 1),
     )
+
+
+def settle(robot: Robot, zoo: Path, *, last: int = 3, noise: float = 0.5) -> Snapshot:
+    """Exchanges a series' last snapshot for a calmer one: the late snapshots' mean weights, with less noise.
+
+    A constant learning rate leaves a learner circling its optimum; the mean of late weights lies nearer to it (stochastic
+    weight averaging, Izmailov et al. 2018). Maximum-entropy learners end with more noise than their return would choose.
+
+    Args:
+        robot: whose series.
+        zoo: the folder that `train` wrote it to.
+        last: snapshots that are averaged.
+        noise: factor of the standard deviations, above 0.
+
+    Returns:
+        The new last snapshot; `zoo.json` tells what it is.
+
+    Raises:
+        UserError: there is no such series, it has fewer snapshots, or was settled before.
+    """
+    series = read_series(robot, zoo)
+    if not 1 <= last <= len(series.snapshots) or noise <= 0:
+        raise UserError(
+            f"{last} snapshots and {noise:g} times the noise cannot be had: {series.folder} has "
+            f"{len(series.snapshots)} snapshots, and a factor is above 0."
+        )
+    if SETTLED in series.trained_with:
+        raise UserError(f"{series.folder} was settled before: its last snapshot is an average already.")
+    actors = [load_snapshot(series, snapshot.steps) for snapshot in series.snapshots[-last:]]
+    actor = TanhGaussianActor(robot.observation_dim, robot.action_dim, **series.architecture).eval()
+    weights = {name: torch.stack([a.state_dict()[name] for a in actors]).mean(0) for name in actor.state_dict()}
+    actor.load_state_dict(weights)
+    output = actor.net[-1]
+    assert isinstance(output, torch.nn.Linear)
+    output.bias.data[robot.action_dim :] += math.log(noise)
+    content = read_json(series.folder / "zoo.json")
+    kept = _keep(actor, robot, series.snapshots[-1].steps, series.folder)
+    content["snapshots"][-1] = asdict(kept)
+    content["trained_with"] += f"; {SETTLED} of the last {last}'s weights, with {noise:g} times the standard deviation"
+    write_json(series.folder / "zoo.json", content)
+    return kept
 
 
 def _contents(robot: Robot, recipe: Recipe, seed: int, snapshots: list[Snapshot]) -> dict[str, Any]:

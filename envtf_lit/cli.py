@@ -142,6 +142,13 @@ def _add_zoo(commands: Any) -> None:
     train.add_argument("--out", type=Path, required=True, metavar="DIR", help="for build's and list's --zoo")
     train.add_argument("--algorithm", choices=["crossq", "sac"], default="crossq", help="default: crossq")
     train.add_argument("--steps", type=int, default=600_000, help="environment steps; default: 600,000")
+    settle = _add(
+        verbs, "settle", "Exchange a series' last snapshot for the late ones' mean, with less noise", _zoo_settle
+    )
+    settle.add_argument("--robot", required=True, choices=ROBOT_NAMES)
+    settle.add_argument("--out", type=Path, required=True, metavar="DIR", help="as given to train")
+    settle.add_argument("--last", type=_natural, default=3, metavar="N", help="snapshots to average; default: 3")
+    settle.add_argument("--noise", type=float, default=0.5, help="factor of the standard deviations; default: 0.5")
     for command in (build, train):
         command.add_argument("--seed", type=_natural, default=0, help="default: 0")
         command.add_argument("--quiet", action="store_true", help="no progress bars")
@@ -506,3 +513,15 @@ def _zoo_train(namespace: argparse.Namespace, rest: list[str]) -> None:
         progress=not namespace.quiet,
     )
     Console().print(f"Wrote {folder}. Next: envtf zoo build --zoo {namespace.out} TASK", soft_wrap=True)
+
+
+def _zoo_settle(namespace: argparse.Namespace, rest: list[str]) -> None:
+    from rich.console import Console
+
+    from envtf_lit.behaviour_training import settle
+    from envtf_lit.tasks import ROBOTS
+
+    robot = ROBOTS[namespace.robot]
+    kept = settle(robot, namespace.out, last=namespace.last, noise=namespace.noise)
+    score = robot.normalised_score(kept.mean_return)
+    Console().print(f"The last snapshot now returns {kept.mean_return:.0f} (score {score:.1f}).", soft_wrap=True)

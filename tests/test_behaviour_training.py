@@ -1,5 +1,6 @@
 """Training the zoo's policies: weights that act as the learner's do, and a series that the zoo reads."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -8,9 +9,9 @@ import pytest
 import torch
 
 from envtf_lit import behaviour_training
-from envtf_lit.behaviour_training import RECIPES, RENORM_EPSILON, _stretch, flax_to_torch, train
+from envtf_lit.behaviour_training import RECIPES, RENORM_EPSILON, _stretch, flax_to_torch, settle, train
 from envtf_lit.cli import main
-from envtf_lit.data.behaviour import collect, read_series
+from envtf_lit.data.behaviour import ZOO, collect, load_snapshot, read_series
 from envtf_lit.errors import UserError
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.tasks import ROBOTS, get_task
@@ -102,3 +103,30 @@ def test_our_actor_acts_as_the_learners(algorithm: str) -> None:
     theirs, _ = learner.predict(observation, deterministic=True)
     ours = behaviour_training._actor(HOPPER, learner).act(torch.from_numpy(observation))
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
+def test_settling_averages_the_late_snapshots_and_calms_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(behaviour_training, "EPISODES", 1)
+    shutil.copytree(ZOO / "hopper", tmp_path / "hopper")
+    before = read_series(HOPPER, tmp_path)
+    late = [load_snapshot(before, snapshot.steps).net[-1] for snapshot in before.snapshots[-2:]]
+    main(["zoo", "settle", "--robot", "hopper", "--out", str(tmp_path), "--last", "2", "--noise", "0.25"])
+    assert "The last snapshot now returns" in capsys.readouterr().out
+    after = read_series(HOPPER, tmp_path)
+    assert after.snapshots[:-1] == before.snapshots[:-1]
+    assert after.trained_with.endswith("the mean of the last 2's weights, with 0.25 times the standard deviation")
+    layer = load_snapshot(after, after.snapshots[-1].steps).net[-1]
+    torch.testing.assert_close(layer.weight, (late[0].weight + late[1].weight) / 2)
+    log_std = (late[0].bias + late[1].bias)[3:] / 2 + np.log(0.25)
+    torch.testing.assert_close(layer.bias[3:], log_std)
+    with pytest.raises(UserError, match="settled before"):
+        settle(HOPPER, tmp_path)
+
+
+@pytest.mark.parametrize(("last", "noise"), [(0, 0.5), (1_000, 0.5), (3, 0.0)])
+def test_settling_refuses_what_cannot_be(tmp_path: Path, last: int, noise: float) -> None:
+    shutil.copytree(ZOO / "hopper", tmp_path / "hopper")
+    with pytest.raises(UserError, match="has 19 snapshots"):
+        settle(HOPPER, tmp_path, last=last, noise=noise)
