@@ -142,9 +142,7 @@ def _add_zoo(commands: Any) -> None:
     train.add_argument("--out", type=Path, required=True, metavar="DIR", help="for build's and list's --zoo")
     train.add_argument("--algorithm", choices=["crossq", "sac"], default="crossq", help="default: crossq")
     train.add_argument("--steps", type=int, default=600_000, help="environment steps; default: 600,000")
-    settle = _add(
-        verbs, "settle", "Exchange a series' last snapshot for the late ones' mean, with less noise", _zoo_settle
-    )
+    settle = _add(verbs, "settle", "Exchange a series' last snapshot for the late ones' calmer mean", _zoo_settle)
     settle.add_argument("--robot", required=True, choices=ROBOT_NAMES)
     settle.add_argument("--out", type=Path, required=True, metavar="DIR", help="as given to train")
     settle.add_argument("--last", type=_natural, default=3, metavar="N", help="snapshots to average; default: 3")
