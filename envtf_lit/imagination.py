@@ -20,6 +20,10 @@ from envtf_lit.policy import Policy, TanhGaussianActor
 from envtf_lit.storage import replacing
 from envtf_lit.world_models.interface import Mode, Prediction, WorldModel
 
+Starts = tuple[
+    Tensor, Tensor, Tensor, Tensor
+]  # observations, actions, lengths, window, as `WorldModel.init` takes them
+
 
 @dataclass(frozen=True)
 class Rollouts:
@@ -96,6 +100,37 @@ class BranchPoints:
         """Rows drawn at random, each with up to `history` steps before it: the arguments of `WorldModel.init`."""
         return self.at(self.rows.draw((count,), generator), history)
 
+    def draw_shared(self, count: int, history: int, share: int, generator: torch.Generator) -> Starts:
+        """`share` rows from each of some windows: the arguments of `WorldModel.init`, its windows too.
+
+        Each row is drawn with the chance it has in `draw`; only, rows come from the same stretch of `share` steps, and
+        nearly without repetition. The model then reads a window once, not once for each row.
+
+        Args:
+            count: rollouts; the last window may start fewer than `share`.
+            history: steps before the stretch that a window begins with, at most.
+            share: rows of a stretch.
+            generator: of the rows.
+        """
+        device, windows = self.starts.device, -(-count // share)
+        drawn = self.rows.draw((windows,), generator)  # by a row's chance the chance of its stretch
+        offset = torch.randint(share, (windows,), generator=generator, device=device)
+        into = drawn - self.starts[drawn]
+        begin = drawn - (into + offset) % share  # the stretches of an episode, cut at a random offset
+        stretch = begin[:, None] + torch.arange(share, device=device)  # (W, share)
+        row = stretch.clamp(0, len(self.starts) - 1)
+        inside = (stretch == row) & (self.starts[row] == self.starts[drawn][:, None])
+        last = torch.where(inside, row, -1).amax(1)
+        cumulative = (self.rows.chances(row) * inside).cumsum(1)
+        shift = torch.rand(windows, 1, generator=generator, device=device, dtype=torch.float64)
+        even = (torch.arange(share, device=device) + shift) / share * cumulative[:, -1:]
+        picked = torch.searchsorted(cumulative, even, right=True)  # systematic: equal chances give every row once
+        rows = torch.minimum(begin[:, None] + picked, last[:, None])  # (W, share)
+        observations, actions, lengths = self.at(last, history + share - 1)
+        first = last + 1 - lengths  # (W,) row that each window begins with
+        window = torch.arange(windows, device=device).repeat_interleave(share)[:count]
+        return observations, actions, (rows - first[:, None] + 1).flatten()[:count], window
+
     def at(self, row: Tensor, history: int) -> tuple[Tensor, Tensor, Tensor]:
         """These rows (B,), each with up to `history` steps before it: the arguments of `WorldModel.init`."""
         device = self.starts.device
@@ -125,7 +160,7 @@ class NoisyPolicy:
 def imagine(
     model: WorldModel,
     policy: Policy,
-    starts: tuple[Tensor, Tensor, Tensor],
+    starts: tuple[Tensor, Tensor, Tensor] | Starts,
     *,
     horizon: int,
     terminated: Callable[[Tensor], Tensor],
@@ -152,10 +187,10 @@ def imagine(
         batch_size: rollouts imagined at a time.
     """
     parts: list[Rollouts] = []
-    for begin in range(0, len(starts[0]), batch_size):
-        chunk = tuple(part[begin : begin + batch_size] for part in starts)
-        state = model.init(*chunk, posterior=posterior, generator=generator)
-        branch = torch.arange(begin, begin + len(chunk[0]), device=chunk[0].device)
+    count = len(starts[2])
+    for begin in range(0, count, batch_size):
+        branch = torch.arange(begin, min(begin + batch_size, count), device=starts[2].device)
+        state = model.init(*_some(starts, branch), posterior=posterior, generator=generator)
         for step in range(horizon + tail):
             actor, how = (policy, mode) if step < horizon else (_Deterministic(policy), "mean")
             part, state = _advance(model, actor, state, branch, step, terminated, novelty_limit, how, generator)
@@ -166,6 +201,15 @@ def imagine(
             if len(alive) < len(branch):
                 state, branch = model.gather(state, alive), branch[alive]
     return Rollouts(**{field.name: torch.cat([getattr(p, field.name) for p in parts]) for field in fields(Rollouts)})
+
+
+def _some(starts: tuple[Tensor, ...], branch: Tensor) -> tuple[Tensor, ...]:
+    """The arguments of `init` for these rollouts (B,) alone."""
+    observations, actions, lengths, *window = starts
+    if not window:
+        return observations[branch], actions[branch], lengths[branch]
+    used, window = window[0][branch].unique(return_inverse=True)
+    return observations[used], actions[used], lengths[branch], window
 
 
 class Imagination:
@@ -196,7 +240,7 @@ class Imagination:
     def rollouts(self, policy: Policy, generator: torch.Generator) -> Rollouts:
         """New branched rollouts under the policy's sampled actions."""
         o = self.options
-        starts = self.starts.draw(o.branches, o.history, generator)
+        starts = self.starts.draw_shared(o.branches, o.history, o.share, generator)
         return imagine(
             self.model,
             policy,

@@ -128,6 +128,7 @@ class GenerateRolloutsOptions:
         branches: rollouts, each from a dataset state drawn at random.
         horizon: steps of each rollout, unless the robot falls first.
         history: real steps given to the model before the branch point, at most `context - 1`.
+        share: rollouts that begin within as many consecutive steps of one window, which the model reads once.
         exploration: scale of the Gaussian noise added to the clone's sampled actions, in units of the action range's
             half.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
@@ -140,6 +141,7 @@ class GenerateRolloutsOptions:
     branches: int = 20_000
     horizon: int = 5
     history: int = 4
+    share: int = 16
     exploration: float = 0.1
     mode: Literal["mean", "sample"] = "sample"
     novelty_limit: float | None = 1.0
@@ -187,6 +189,8 @@ class ImaginationOptions:
         tail: deterministic steps after the horizon, which are not learned from but whose rewards, and end, enter the
             targets of the steps before them (model-based value expansion, Feinberg et al. 2018).
         history: real steps given to the model before the branch point.
+        share: rollouts that begin within as many consecutive steps of one window, which the model reads once: it pays
+            where rollouts are short.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
         posterior: above zero each rollout runs in a world model of its own, drawn from the posterior of the last layer
             with its deviation from the mean times this.
@@ -210,6 +214,7 @@ class ImaginationOptions:
     horizon: int = 1
     tail: int = 50
     history: int = 4
+    share: int = 1
     mode: Literal["mean", "sample"] = "sample"
     posterior: float = 1.0
     buffer_size: int = 4_500

@@ -137,7 +137,8 @@ def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool 
         device = pick_device()
         model = load_world_model(root / WORLD_MODEL).to(device)
         generator = torch.Generator(device).manual_seed(params.seed)
-        starts = BranchPoints(dataset, device).draw(options.branches, options.history, generator)
+        points = BranchPoints(dataset, device)
+        starts = points.draw_shared(options.branches, options.history, options.share, generator)
         begin = time.perf_counter()
         with autocast(device, params.precision):
             rollouts = imagine(

@@ -40,7 +40,7 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("updates_per_step", "batch_size", "clone_updates", "clone_batch_size", "branches"), _COUNT),
     **dict.fromkeys(("horizon", "buffer_size", "hidden", "critics", "sampled_actions", "episodes"), _COUNT),
     **dict.fromkeys(("trajectories", "n_step", "selection_steps", "members", "elites", "patience"), _COUNT),
-    **dict.fromkeys(("rollouts", "max_steps", "value_passes"), _COUNT),
+    **dict.fromkeys(("rollouts", "share", "max_steps", "value_passes"), _COUNT),
     **dict.fromkeys(
         ("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty", "tail", "posterior"),
         _NOT_NEGATIVE,

@@ -22,7 +22,9 @@ class LinearWorld:
     observation_dim: int = 3
     action_dim: int = 1
 
-    def init(self, observations: Tensor, actions: Tensor, lengths: Tensor, **posterior) -> Tensor:
+    def init(
+        self, observations: Tensor, actions: Tensor, lengths: Tensor, window: Tensor | None = None, **posterior
+    ) -> Tensor:
         return observations[torch.arange(len(lengths)), lengths - 1]
 
     def step(self, state: Tensor, action: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None):

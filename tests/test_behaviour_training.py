@@ -11,7 +11,7 @@ import torch
 from envtf_lit import behaviour_training
 from envtf_lit.behaviour_training import RECIPES, RENORM_EPSILON, _stretch, flax_to_torch, settle, train
 from envtf_lit.cli import main
-from envtf_lit.data.behaviour import ZOO, collect, load_snapshot, read_series
+from envtf_lit.data.behaviour import ZOO, Series, collect, load_snapshot, read_series
 from envtf_lit.errors import UserError
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.tasks import ROBOTS, get_task
@@ -105,19 +105,25 @@ def test_our_actor_acts_as_the_learners(algorithm: str) -> None:
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
 
 
+def _last_layer(series: Series, steps: int) -> torch.nn.Linear:
+    layer = load_snapshot(series, steps).net[-1]
+    assert isinstance(layer, torch.nn.Linear)
+    return layer
+
+
 def test_settling_averages_the_late_snapshots_and_calms_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(behaviour_training, "EPISODES", 1)
     shutil.copytree(ZOO / "hopper", tmp_path / "hopper")
     before = read_series(HOPPER, tmp_path)
-    late = [load_snapshot(before, snapshot.steps).net[-1] for snapshot in before.snapshots[-2:]]
+    late = [_last_layer(before, snapshot.steps) for snapshot in before.snapshots[-2:]]
     main(["zoo", "settle", "--robot", "hopper", "--out", str(tmp_path), "--last", "2", "--noise", "0.25"])
     assert "The last snapshot now returns" in capsys.readouterr().out
     after = read_series(HOPPER, tmp_path)
     assert after.snapshots[:-1] == before.snapshots[:-1]
     assert after.trained_with.endswith("the mean of the last 2's weights, with 0.25 times the standard deviation")
-    layer = load_snapshot(after, after.snapshots[-1].steps).net[-1]
+    layer = _last_layer(after, after.snapshots[-1].steps)
     torch.testing.assert_close(layer.weight, (late[0].weight + late[1].weight) / 2)
     log_std = (late[0].bias + late[1].bias)[3:] / 2 + np.log(0.25)
     torch.testing.assert_close(layer.bias[3:], log_std)

@@ -18,7 +18,7 @@ from envtf_lit.world_models.horizon import Scale
 class Remembering(LinearWorld):
     """The true world, plus an error in the first dimension that halves with every true state it is shown."""
 
-    def init(self, observations: Tensor, actions: Tensor, lengths: Tensor, **posterior):
+    def init(self, observations: Tensor, actions: Tensor, lengths: Tensor, window: Tensor | None = None, **posterior):
         self.seen = 0
         return super().init(observations, actions, lengths)
 

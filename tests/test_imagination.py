@@ -41,6 +41,37 @@ def test_rows_are_branched_from_as_often_as_they_weigh():
     torch.testing.assert_close(shares, weights / 4, atol=0.01, rtol=0)
 
 
+@pytest.mark.parametrize("weights", [None, [0.0, 1.0, 0.0, 0.0, 3.0, 2.0, 0.0, 0.0, 1.0]])
+@pytest.mark.parametrize("share", [1, 2, 4, 16])
+def test_rows_of_shared_windows_are_real_and_as_frequent_as_they_weigh(weights: list[float] | None, share: int) -> None:
+    """Nine rows, whose observations are their numbers, in episodes shorter and longer than what is shared."""
+    dataset, generator = make_dataset(), torch.Generator().manual_seed(0)
+    chances = torch.tensor(weights or [1.0] * 9)
+    points = BranchPoints(dataset, weights=None if weights is None else chances)
+    observations, actions, lengths, window = points.draw_shared(40_001, 2, share, generator)
+    assert len(lengths) == len(window) == 40_001 and len(observations) == -(-40_001 // share) == len(actions)
+    rows = observations[window, lengths - 1, 0].long()
+    shares = torch.bincount(rows, minlength=9) / 40_001
+    torch.testing.assert_close(shares, chances / chances.sum(), atol=0.015, rtol=0)
+    assert (rows[chances[rows] == 0]).numel() == 0
+    start = torch.as_tensor(dataset.episode_starts[dataset.episode_index])
+    seen = lengths - 1  # at least the two steps that were asked for, or as many as there are; never another episode's
+    assert (seen >= torch.minimum(rows - start[rows], torch.tensor(2))).all() and (rows - seen >= start[rows]).all()
+    assert torch.equal(observations[window, 0, 0].long(), rows - seen)
+
+
+def test_imagining_in_parts_of_shared_windows_equals_imagining_at_once() -> None:
+    torch.manual_seed(0)
+    model, actor = EnvironmentTransformer(2, 1, layers=1, heads=1, width=8, context=8), TanhGaussianActor(2, 1)
+    starts = BranchPoints(make_dataset()).draw_shared(50, 2, 3, torch.Generator().manual_seed(0))
+    never = lambda observation: torch.zeros(len(observation), dtype=torch.bool)  # noqa: E731
+    run = lambda size: imagine(model, actor, starts, horizon=0, tail=2, terminated=never, batch_size=size)  # noqa: E731
+    parts, whole = run(7), run(50)
+    order = parts.branch + 50 * parts.step
+    for name in ("observations", "next_observations", "rewards", "branch"):
+        torch.testing.assert_close(vars(parts)[name][order.argsort()], vars(whole)[name])
+
+
 def test_rollouts_are_chained_and_stop_where_the_robot_falls():
     rollouts = make_rollouts()
     assert 0 < rollouts.terminated.sum() < 50

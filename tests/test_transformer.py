@@ -11,7 +11,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.params import ModelOptions
 from envtf_lit.world_models.interface import Prediction
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
-from envtf_lit.world_models.transformer import EnvironmentTransformer, rotate
+from envtf_lit.world_models.transformer import LARGE_CACHE, Attention, EnvironmentTransformer, rotate
 
 S, A = 5, 2
 
@@ -77,6 +77,41 @@ def test_histories_of_different_length_equal_their_own_uncached_pass():
                 alone = model.predict(hidden[:, -1], past[:, -1]).observation
             torch.testing.assert_close(steps[t][row], alone[0], atol=1e-5, rtol=1e-4)
             past = torch.cat([past, alone[:, None]], 1)
+
+
+def test_rollouts_that_share_a_window_equal_those_with_histories_of_their_own():
+    """One pass over two windows of 12 steps, past the context of 6, against a pass for each rollout."""
+    model, (observations, actions) = make_model(), sequences(2, 13)
+    window, lengths = torch.tensor([1, 0, 0, 1, 0]), torch.tensor([12, 1, 5, 7, 12])
+    with torch.no_grad():
+        shared = model.init(observations[:, :12], actions[:, :11], lengths, window)
+        alone = model.init(observations[window, :12], actions[window, :11], lengths)
+        for t in range(8):
+            shared, one = model.step(shared, actions[window, t])
+            alone, other = model.step(alone, actions[window, t])
+            torch.testing.assert_close(one.observation, other.observation)
+        hidden, _ = model.encode(observations[1:, :7], actions[1:, :7], cached=False)
+        fourth = model.init(observations, actions[:, :12], lengths[3:4], window[3:4])
+        _, step = model.step(fourth, actions[1:, 6])
+    torch.testing.assert_close(step.observation, model.predict(hidden[:, -1], observations[1:, 6]).observation)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_large_cache_is_read_token_by_token_to_the_same_effect(masked):
+    """Both ways to attend, on either side of the size at which a CPU changes over."""
+    attention = Attention(ModelOptions(width=64, heads=4))
+    generator = torch.Generator().manual_seed(0)
+    keys, values = torch.randn(2, 3, 1_600, 4, 16, generator=generator)
+    q = torch.randn(1_600, 4, 16, generator=generator)
+    mask = torch.rand(3, 1_600, 1, generator=generator) < 0.6 if masked else None
+    if mask is not None:
+        mask[2] = True
+    assert keys.numel() > LARGE_CACHE > keys[:, :100].numel()
+    with torch.no_grad():
+        large = attention.recall(q, keys, values, mask)
+        few = slice(0, 100)
+        small = attention.recall(q[few], keys[:, few], values[:, few], None if mask is None else mask[:, few])
+    torch.testing.assert_close(large[few], small)
 
 
 def test_fork_and_gather_continue_each_row_on_its_own():

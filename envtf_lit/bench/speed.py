@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from envtf_lit.bench.machine import bench_device, facts, in_turns, ratio, seconds, typical
 from envtf_lit.config import preset_params
-from envtf_lit.imagination import imagine
-from envtf_lit.params import Precision, TrainModelOptions
+from envtf_lit.imagination import Starts, imagine
+from envtf_lit.params import GenerateRolloutsOptions, Precision, TrainModelOptions
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.storage import write_json
 from envtf_lit.tasks import ROBOTS, Robot, never_terminated
@@ -28,6 +28,7 @@ from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.lit import LitWorldModel
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
+SHARE = GenerateRolloutsOptions().share  # rollouts that begin in one window
 UNCACHED_CONTEXT = 32  # at which the cache is measured
 CHUNK = 512  # windows that the model without its cache takes at a time
 MATMUL = {"cpu": (2_048, 3)}  # size and number of the products that give the peak; elsewhere:
@@ -85,6 +86,7 @@ def bench_model(
         "imagined_per_second": steps / typical(timings, "short"),
         "imagined_per_second_full": steps / typical(timings, "full"),
         "imagined_per_second_from_history": steps / typical(timings, "history"),
+        "imagined_per_second_from_shared_history": steps / typical(timings, "shared"),
         "ensemble_per_second": steps / typical(timings, "ensemble"),
         f"{robot}_steps_per_second": threads * real_steps / typical(timings, "real"),
         "ratio_vs_ensemble_short": ratio(timings, "ensemble", "short"),
@@ -116,7 +118,9 @@ def _imagination(
     actor = TanhGaussianActor(S, A).to(device)
     single, past = _histories(robot, batch, 1, device), _histories(robot, batch, context, device)
 
-    def rollouts(model: WorldModel, starts: tuple[Tensor, Tensor, Tensor]) -> Callable[[], float]:
+    shared = _shared_histories(robot, batch, context, device)
+
+    def rollouts(model: WorldModel, starts: tuple[Tensor, Tensor, Tensor] | Starts) -> Callable[[], float]:
         run = lambda: imagine(model, actor, starts, horizon=horizon, terminated=never_terminated, batch_size=batch)  # noqa: E731
         return lambda: seconds(run, device)
 
@@ -124,6 +128,7 @@ def _imagination(
         "short": rollouts(transformer, single),
         "ensemble": rollouts(ensemble, single),
         "history": rollouts(transformer, past),
+        "shared": rollouts(transformer, shared),
         "full": _steps(transformer, transformer.init(*past), actor, horizon, device),
         "ensemble_steps": _steps(ensemble, ensemble.init(*single), actor, horizon, device),
     }
@@ -170,6 +175,14 @@ def _histories(robot: Robot, batch: int, length: int, device: torch.device) -> t
     observations = torch.randn(batch, length, robot.observation_dim, device=device)
     actions = torch.randn(batch, length - 1, robot.action_dim, device=device)
     return observations, actions, torch.full((batch,), length, device=device)
+
+
+def _shared_histories(robot: Robot, batch: int, length: int, device: torch.device) -> Starts:
+    """The same where `SHARE` rollouts begin in each window, one step apart."""
+    windows = -(-batch // SHARE)
+    observations, actions, _ = _histories(robot, windows, length + SHARE - 1, device)
+    branch = torch.arange(batch, device=device)
+    return observations, actions, length + branch % SHARE, branch // SHARE
 
 
 def _frozen(model: Any, device: torch.device) -> Any:

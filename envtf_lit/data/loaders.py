@@ -41,6 +41,11 @@ class WeightedRows:
         uniform = torch.rand(shape, generator=generator, device=self.cumulative.device, dtype=torch.float64)
         return torch.searchsorted(self.cumulative, uniform).clamp(max=len(self.cumulative) - 1)
 
+    def chances(self, rows: Tensor) -> Tensor:
+        """The chance of each of these rows (...), float64."""
+        before = torch.where(rows > 0, self.cumulative[(rows - 1).clamp(min=0)], 0.0)
+        return self.cumulative[rows] - before
+
 
 class DrawSampler(Sampler[Tensor]):
     """Yields `batches` tensors of draws from [0, rows), of shape `shape`, anew in each epoch.

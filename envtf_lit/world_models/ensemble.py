@@ -176,13 +176,15 @@ class EnsembleDynamics(nn.Module):
         observations: Tensor,
         actions: Tensor,
         lengths: Tensor,
+        window: Tensor | None = None,
         *,
         posterior: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> EnsembleState:
         """See `WorldModel.init`. Of the histories only the current observation counts."""
-        B = len(observations)
-        current = observations[torch.arange(B, device=observations.device), lengths - 1]
+        B = len(lengths)
+        window = torch.arange(B, device=lengths.device) if window is None else window
+        current = observations[window, lengths - 1]
         if posterior <= 0:
             return EnsembleState(current)
         if len(self.elite) == 1:

@@ -50,6 +50,7 @@ class WorldModel(Protocol):
         observations: Tensor,
         actions: Tensor,
         lengths: Tensor,
+        window: Tensor | None = None,
         *,
         posterior: float = 0.0,
         generator: torch.Generator | None = None,
@@ -57,9 +58,11 @@ class WorldModel(Protocol):
         """Starts B rollouts from histories.
 
         Args:
-            observations: (B, T, S), right-padded; the last valid one has no action yet.
-            actions: (B, T - 1, A), right-padded.
-            lengths: (B,) number of valid observations of each row, 1 to T.
+            observations: (W, T, S) windows of a log, right-padded.
+            actions: (W, T - 1, A), right-padded; a rollout's current state has no action yet.
+            lengths: (B,) observations of its window that each rollout has seen, 1 to T; the last is its present one.
+            window: (B,) the window of each rollout; None where each has one of its own, W = B. Many rollouts that begin
+                in one window cost no more reading than one.
             posterior: above zero each rollout runs, from end to end, in a model of its own, drawn from the posterior
                 with its deviation from the mean model times this (1: as it is).
             generator: of those draws.

@@ -23,14 +23,14 @@ from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 from envtf_lit.world_models.recalibration import standardised_residuals, variance_factor
 
 LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -14.0, 4.0
-CACHE_SLOTS = 8  # at the start of a rollout, doubled when full: a short one need not pay for the whole context
+LARGE_CACHE = 2**18  # numbers; beyond, a CPU takes the cache token by token, since a batch of tiny products is slower
 
 
 def rotate(x: Tensor, positions: Tensor) -> Tensor:
-    """Rotary position embedding (Su et al. 2021) of (..., T, d) at integer positions (T,)."""
+    """Rotary position embedding (Su et al. 2021) of (..., d) at integer positions (...), broadcast against it."""
     half = x.shape[-1] // 2
     frequency = 10_000.0 ** (-torch.arange(half, device=x.device, dtype=torch.float32) / half)
-    angle = positions.float()[:, None] * frequency  # (T, d/2)
+    angle = positions.float()[..., None] * frequency  # (..., d/2)
     cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
     first, second = x[..., :half], x[..., half:]
     return torch.cat([first * cos - second * sin, second * cos + first * sin], dim=-1)
@@ -58,31 +58,51 @@ class Attention(nn.Module):
         q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, T, d)
         return rotate(q, positions), rotate(k, positions), v
 
-    def merge(self, y: Tensor) -> Tensor:
-        B, H, T, d = y.shape
-        return self.out(y.transpose(1, 2).reshape(B, T, H * d))  # (B, T, D)
-
     def forward(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
         """Whole sequences (B, H, T, d); `mask` None means plain causal attention."""
         if q.device.type == "cpu":  # torch's fused kernel there has a bf16 backward pass five to eight times slower
-            T = q.shape[2]
-            return self.attend(q, k, v, window_mask(T, T, q.device) if mask is None else mask)
-        dropout = self.dropout if self.training else 0.0
-        y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=mask is None, dropout_p=dropout)
-        return self.merge(y)
+            y = self._products(q, k, v, window_mask(T := q.shape[2], T, q.device) if mask is None else mask)
+        else:
+            dropout = self.dropout if self.training else 0.0
+            y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=mask is None, dropout_p=dropout)
+        return self.out(y.transpose(1, 2).flatten(2))  # (B, T, D)
 
-    def attend(self, q: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
-        """Queries (B, H, T, d) over keys and values (B, H, C, d), as two batched products; what `mask` lacks is hid."""
-        with torch.autocast(q.device.type, enabled=False):  # or a fp32 cache would be cast, whole, at every step
-            few = q.shape[2] == 1 and keys.shape[2] <= CACHE_SLOTS  # where a batch of tiny products is slower
-            score = (q * keys).sum(-1)[:, :, None] if few else q @ keys.transpose(-2, -1)
-            score = score * q.shape[-1] ** -0.5  # (B, H, T, C)
+    def _products(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
+        score = (q @ k.transpose(-2, -1) * q.shape[-1] ** -0.5).masked_fill(~mask, float("-inf"))  # (B, H, T, T)
+        weight = F.dropout(score.float().softmax(-1), self.dropout, self.training)
+        return weight.to(v.dtype) @ v
+
+    def recall(self, q: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
+        """One token's queries (B, H, d) over cached keys and values (C, B, H, d); `mask` is (C, B, 1)."""
+        with torch.autocast(q.device.type, enabled=False):  # or the fp32 cache would be cast, whole, at every step
+            score = _scores(q.float(), keys) * q.shape[-1] ** -0.5  # (C, B, H)
             if mask is not None:
                 score = score.masked_fill(~mask, float("-inf"))
-            weight = F.dropout(score.float().softmax(-1), self.dropout, self.training)
-            weight = weight.to(values.dtype)
-            y = (weight.mT * values).sum(2, keepdim=True) if few else weight @ values
-        return self.merge(y)
+            weight = F.dropout(score.softmax(0), self.dropout, self.training)
+            y = _mixture(weight, values)
+        return self.out(y.flatten(1))  # (B, D)
+
+
+def _token_by_token(cache: Tensor) -> bool:
+    return cache.device.type == "cpu" and cache.numel() > LARGE_CACHE
+
+
+def _scores(q: Tensor, keys: Tensor) -> Tensor:
+    """Products (C, B, H) of queries (B, H, d) with keys (C, B, H, d)."""
+    if _token_by_token(keys):
+        return torch.stack([(q * key).sum(-1) for key in keys.unbind()])
+    return torch.einsum("bhd,cbhd->cbh", q, keys)
+
+
+def _mixture(weight: Tensor, values: Tensor) -> Tensor:
+    """Sums (B, H, d) of values (C, B, H, d), weighted by (C, B, H)."""
+    if not _token_by_token(values):
+        return torch.einsum("cbh,cbhd->bhd", weight, values)
+    first, *others = zip(weight.unsqueeze(-1).unbind(), values.unbind(), strict=True)
+    y = first[0] * first[1]
+    for share, value in others:
+        y = y.addcmul_(share, value)
+    return y
 
 
 class Block(nn.Module):
@@ -110,8 +130,8 @@ class TransformerState:
     """A batch of rollouts under way: the ring cache, the clock, and the state that has no action yet.
 
     Attributes:
-        cache: per layer, keys and values (B, H, C, d), C growing up to the context; token t lies in slot t mod context.
-            Slots without a token hold zeros, and matrix products run over all of them: a part would have to be copied.
+        cache: per layer, keys and values (context, B, H, d); token t lies in slot t mod context, and slots that have
+            held none hold nothing.
         clock: position of the next token, the same for all rows (histories are right-aligned).
         first: (B,) position of each row's first token, or None where all rows began at 0.
         observation: (B, S) current observation.
@@ -221,12 +241,12 @@ class EnvironmentTransformer(nn.Module):
         return self.heads(hidden)
 
     def encode(
-        self, observations: Tensor, actions: Tensor, *, cached: bool, first: Tensor | None = None
+        self, observations: Tensor, actions: Tensor, *, cached: bool
     ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
         """Last hidden tokens (B, T, D) and, if `cached`, each layer's keys and values (B, H, T, d)."""
         T = observations.shape[1]
         positions = torch.arange(T, device=observations.device)
-        mask = self._mask(positions, first)
+        mask = window_mask(T, self.options.context, positions.device) if T > self.options.context else None
         x = self.embed(self.normaliser.token(observations, actions))
         cache = []
         for block in self._stack():
@@ -235,18 +255,6 @@ class EnvironmentTransformer(nn.Module):
                 cache.append((k, v))
             x = block.finish(x, block.attention(q, k, v, mask))
         return self.norm(x), cache
-
-    def _mask(self, positions: Tensor, first: Tensor | None) -> Tensor | None:
-        """(T, T), or (B, 1, T, T) where rows begin at `first`, or None where plain causal attention is meant."""
-        T = len(positions)
-        if T <= self.options.context and first is None:
-            return None
-        mask = window_mask(T, self.options.context, positions.device)
-        if first is None:
-            return mask
-        seen = positions >= first[:, None]  # (B, T)
-        itself = torch.eye(T, dtype=torch.bool, device=positions.device)  # padding on the left needs a finite softmax
-        return (mask & seen[:, None, :] | itself)[:, None]
 
     def heads(self, hidden: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Hidden tokens (..., D) to mean, log-variance, epistemic log-variance or None, each (..., S + 1), in fp32."""
@@ -323,32 +331,31 @@ class EnvironmentTransformer(nn.Module):
         observations: Tensor,
         actions: Tensor,
         lengths: Tensor,
+        window: Tensor | None = None,
         *,
         posterior: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> TransformerState:
-        """See `WorldModel.init`. One causal pass over the histories fills the cache."""
-        B, T, _ = observations.shape
-        current = observations[torch.arange(B, device=observations.device), lengths - 1]
-        context, H, d = self.options.context, self.options.heads, self.options.width // self.options.heads
-        slots = CACHE_SLOTS
-        while slots < T - 1:
-            slots *= 2
-        size = (B, H, min(slots, context), d)
-        cache = [(current.new_zeros(size), current.new_zeros(size)) for _ in self.blocks]
+        """See `WorldModel.init`. One causal pass over the windows serves all rollouts that begin in them."""
+        B, longest = len(lengths), observations.shape[1] - 1  # rollouts, and tokens of a history
+        window = torch.arange(B, device=lengths.device) if window is None else window
+        current = observations[window, lengths - 1]
+        clock = min(
+            longest, self.options.context - 1
+        )  # the token before the current state gets the same position in all
+        size = (self.options.context, B, self.options.heads, self.options.width // self.options.heads)
+        cache = [(current.new_empty(size), current.new_empty(size)) for _ in self.blocks]
         first = None
-        if T > 1:
-            shift = T - lengths  # right-align: the token before the current state gets position T - 2 in every row
-            index = (torch.arange(T - 1, device=shift.device) - shift[:, None]).clamp(min=0)[..., None]  # (B, T-1, 1)
-            past = torch.take_along_dim(observations, index, 1), torch.take_along_dim(actions, index, 1)
-            first = shift if bool((shift > 0).any()) else None
-            _, tokens = self.encode(*past, cached=True, first=first)
-            kept = torch.arange(max(0, T - 1 - context), T - 1, device=shift.device)
+        if clock > 0:
+            shift = clock - (lengths - 1)  # (B,) from a token's position in the window to that in the cache
+            index = torch.arange(clock, device=shift.device)[:, None] - shift  # (clock, B)
+            first = shift.clamp(min=0) if bool((shift > 0).any()) else None
+            _, tokens = self.encode(observations[:, :-1], actions, cached=True)
             for (keys, values), (k, v) in zip(cache, tokens, strict=True):
-                keys[:, :, kept % context] = k[:, :, kept].float()
-                values[:, :, kept % context] = v[:, :, kept].float()
+                k, v = (x.transpose(1, 2)[window, index.clamp(min=0)].float() for x in (k, v))  # (clock, B, H, d)
+                keys[:clock], values[:clock] = rotate(k, shift[:, None]), v
         drawn = posterior * self._posterior().draw(B, generator) if posterior > 0 else None
-        return TransformerState(cache, T - 1, first, current, drawn)
+        return TransformerState(cache, clock, first, current, drawn)
 
     def _posterior(self) -> LastLayerLaplace:
         if self.laplace is None:
@@ -368,34 +375,25 @@ class EnvironmentTransformer(nn.Module):
     ) -> tuple[TransformerState, Prediction]:
         """See `WorldModel.step`. One token per call; the cache is written in place unless gradients are needed."""
         position = torch.tensor([state.clock], device=action.device)
-        x = self.embed(self.normaliser.token(state.observation, action))[:, None]  # (B, 1, D)
-        slot = state.clock % self.options.context
-        before = [(self._with_room(keys, slot), self._with_room(values, slot)) for keys, values in state.cache]
-        filled, slots = min(state.clock + 1, self.options.context), before[0][0].shape[2]
-        seen = filled if filled <= CACHE_SLOTS else slots
-        mask = self._visible(state, seen)
+        x = self.embed(self.normaliser.token(state.observation, action))  # (B, D)
+        slot, filled = state.clock % self.options.context, min(state.clock + 1, self.options.context)
+        mask = self._visible(state, filled)
         cache = []
-        for block, (keys, values) in zip(self._stack(), before, strict=True):
-            q, k, v = block.attention.project(block.attention_norm(x), position)
-            keys, values = _write(keys, k, slot), _write(values, v, slot)
+        for block, (keys, values) in zip(self._stack(), state.cache, strict=True):
+            q, k, v = block.attention.project(block.attention_norm(x)[:, None], position)
+            keys, values = _write(keys, k[:, :, 0], slot), _write(values, v[:, :, 0], slot)
             cache.append((keys, values))
-            attended = block.attention.attend(q.float(), keys[:, :, :seen], values[:, :, :seen], mask)
-            x = block.finish(x, attended)
-        prediction = self.predict(self.norm(x)[:, 0], state.observation, state.drawn, mode=mode, generator=generator)
+            x = block.finish(x, block.attention.recall(q[:, :, 0], keys[:filled], values[:filled], mask))
+        prediction = self.predict(self.norm(x), state.observation, state.drawn, mode=mode, generator=generator)
         return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
 
-    def _with_room(self, cache: Tensor, slot: int) -> Tensor:
-        """The cache (B, H, C, d), with up to twice the slots where it lacks this one."""
-        slots = cache.shape[2]
-        return cache if slot < slots else F.pad(cache, (0, 0, 0, min(slots, self.options.context - slots)))
-
-    def _visible(self, state: TransformerState, slots: int) -> Tensor | None:
-        """(slots,) or (B, 1, 1, slots): which hold a token of the row itself, or the present one; None where all do."""
-        if state.first is None and state.clock + 1 >= slots:
+    def _visible(self, state: TransformerState, filled: int) -> Tensor | None:
+        """(C, B, 1), which of the filled slots hold a token of the row itself; None where all do."""
+        if state.first is None:
             return None
-        slot = torch.arange(slots, device=state.observation.device)
-        position = state.clock - (state.clock - slot) % self.options.context  # below zero where there is no token yet
-        return position >= 0 if state.first is None else (position >= state.first[:, None])[:, None, None]
+        slot = torch.arange(filled, device=state.observation.device)
+        position = state.clock - (state.clock - slot) % self.options.context
+        return (position[:, None] >= state.first)[..., None]
 
     def predict(
         self,
@@ -455,7 +453,8 @@ class EnvironmentTransformer(nn.Module):
 
     def gather(self, state: TransformerState, index: Tensor) -> TransformerState:
         """See `WorldModel.gather`."""
-        cache = [(keys[index], values[index]) for keys, values in state.cache]
+        filled = min(state.clock, self.options.context)
+        cache = [(_take(keys, index, filled), _take(values, index, filled)) for keys, values in state.cache]
         first = None if state.first is None else state.first[index]
         drawn = None if state.drawn is None else state.drawn[index]
         return TransformerState(cache, state.clock, first, state.observation[index], drawn)
@@ -474,8 +473,15 @@ def _bound(log_variance: Tensor) -> Tensor:
 
 
 def _write(cache: Tensor, token: Tensor, slot: int) -> Tensor:
-    """Puts (B, H, 1, d) into a slot of (B, H, C, d): in place, or into a copy when gradients flow through it."""
+    """Puts (B, H, d) into a slot of (C, B, H, d): in place, or into a copy when gradients flow through it."""
     if torch.is_grad_enabled() and (token.requires_grad or cache.requires_grad):
         cache = cache.clone()
-    cache[:, :, slot] = token[:, :, 0].to(cache.dtype)
+    cache[slot] = token.to(cache.dtype)
     return cache
+
+
+def _take(cache: Tensor, index: Tensor, filled: int) -> Tensor:
+    """These rows of a cache (C, B, H, d), of which the first so many slots are filled."""
+    taken = cache.new_empty(cache.shape[0], len(index), *cache.shape[2:])
+    taken[:filled] = cache[:filled, index]
+    return taken
