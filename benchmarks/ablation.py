@@ -20,7 +20,7 @@ TOKENS = TrainModelOptions().batch_size * ModelOptions().context  # steps of eac
 
 
 def variants(updates: int) -> dict[str, TrainModelOptions]:
-    """Training options by name; each changes one thing of the suite's transformer, the last one two."""
+    """Training options by name; each changes one thing of the suite's transformer, one of them two."""
     plain = TrainModelOptions(updates=updates, updates_per_epoch=min(1_000, updates))
 
     def model(**changes: object) -> TrainModelOptions:
@@ -36,6 +36,9 @@ def variants(updates: int) -> dict[str, TrainModelOptions]:
         "scheduled_10": model(scheduled_sampling=0.1),
         "scheduled_50": model(scheduled_sampling=0.5),
         "scheduled_10_bounded": model(scheduled_sampling=0.1, bounded=True),
+        "multi_step_2": model(multi_step=2),
+        "multi_step_4": model(multi_step=4),
+        "any_step_50": model(any_step=0.5),
     }
 
 
