@@ -141,7 +141,7 @@ def measure(task: Task, suite: Suite, options: CalibrationOptions, *, progress: 
         options: what is measured.
         progress: shows bars while strange data are collected.
     """
-    course = _Course(task, suite, options, progress)
+    course = Course(task, suite, options, progress)
     findings = Findings({}, {})
     for name in MODELS:
         model = load_world_model(suite.folders[name]).to(course.device)
@@ -154,7 +154,7 @@ def measure(task: Task, suite: Suite, options: CalibrationOptions, *, progress: 
     return findings
 
 
-class _Course:
+class Course:
     """What a robot's models are measured on.
 
     Args:

@@ -1,0 +1,122 @@
+"""Random-prior heads beside the last layer's posterior: `python benchmarks/priors.py --out OUT.json --robot hopper`.
+
+Ten small networks on the hidden token, each with a fixed random network of its own added (Osband et al. 2018), learn
+the transformer's training residuals; where they disagree, data were lacking. Judged as `envtf calibrate` judges, on the
+same pairs: AUROC of each contrast. The suite's models are taken from the work folder, or trained.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from envtf_lit.calibration import CalibrationOptions, Course
+from envtf_lit.data.loaders import Windows
+from envtf_lit.evaluation.calibration import Points, auroc, novelties
+from envtf_lit.suite import WORK, SuiteOptions, build_suite
+from envtf_lit.tasks import ROBOTS, get_task
+from envtf_lit.world_models.store import load_world_model
+from envtf_lit.world_models.transformer import EnvironmentTransformer
+
+HEADS, HIDDEN, UPDATES, BATCH, ROWS = 10, 128, 2_000, 256, 50_000
+
+
+class Networks(nn.Module):
+    """`HEADS` networks of one hidden layer, side by side."""
+
+    def __init__(self, inputs: int, outputs: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.first = nn.Parameter(torch.randn(HEADS, inputs, HIDDEN, generator=generator) * inputs**-0.5)
+        self.bias = nn.Parameter(torch.randn(HEADS, 1, HIDDEN, generator=generator))
+        self.second = nn.Parameter(torch.randn(HEADS, HIDDEN, outputs, generator=generator) * HIDDEN**-0.5)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs) to (HEADS, N, outputs)."""
+        return torch.tanh(x @ self.first + self.bias) @ self.second
+
+
+def features(model: EnvironmentTransformer, points: Points) -> tuple[Tensor, Tensor]:
+    """Last hidden tokens (N, D) and normalised pairs (N, S + A)."""
+    last, rows = points.lengths - 1, torch.arange(len(points.actions))
+    actions = nn.functional.pad(points.past_actions, (0, 0, 0, 1))
+    actions[rows, last] = points.actions
+    with torch.no_grad():
+        parts = zip(points.observations.split(1_024), actions.split(1_024), strict=True)
+        hidden = torch.cat([model.encode(*part, cached=False)[0] for part in parts])[rows, last]
+        return hidden, model.normaliser.token(points.observations[rows, last], points.actions)
+
+
+def train(
+    model: EnvironmentTransformer, windows: Windows, weight: float, generator: torch.Generator
+) -> tuple[Networks, Networks]:
+    """The networks that learn, and those that stay random, `weight` times which is added."""
+    tiles = windows.tiles()
+    tiles = tiles[torch.randperm(len(tiles), generator=generator)[: ROWS // model.options.context]]
+    batch = windows[tiles]
+    valid = batch["mask"].bool()
+    with torch.no_grad():
+        hidden = model.encode(batch["observations"], batch["actions"], cached=False)[0][valid]
+        token = model.normaliser.token(batch["observations"], batch["actions"])[valid]
+        target = model.normaliser.target(batch["observations"], batch["next_observations"], batch["rewards"])[valid]
+        residual = target - model.heads(hidden)[0]
+    learner = Networks(hidden.shape[1], residual.shape[1], generator)
+    prior = Networks(token.shape[1], residual.shape[1], generator).requires_grad_(False)
+    optimizer = torch.optim.Adam(learner.parameters(), lr=0.001)
+    for _ in range(UPDATES):
+        rows = torch.randint(len(hidden), (BATCH,), generator=generator)
+        error = learner(hidden[rows]) + weight * prior(token[rows]) - residual[rows]
+        optimizer.zero_grad()
+        error.square().mean((1, 2)).sum().backward()
+        optimizer.step()
+    return learner, prior
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON")
+    parser.add_argument("--robot", choices=ROBOTS, default="hopper")
+    parser.add_argument("--tier", default="medium")
+    parser.add_argument("--work", type=Path, default=WORK, metavar="DIR")
+    parser.add_argument("--transitions", type=int, default=100_000)
+    parser.add_argument("--updates", type=int, default=6_000, help="of the transformer")
+    parser.add_argument("--weights", type=float, nargs="+", default=[0.3, 1.0, 3.0], help="of the random networks")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    given = parser.parse_args()
+    torch.set_num_threads(given.threads)
+    options = SuiteOptions(transitions=given.transitions, updates=given.updates, seed=given.seed, threads=given.threads)
+    task = get_task(f"{given.robot}-{given.tier}")
+    suite = build_suite(task.name, given.work, options, models=("transformer",))
+    model = load_world_model(suite.folders["transformer"])
+    assert isinstance(model, EnvironmentTransformer)
+    course = Course(task, suite, CalibrationOptions(), True)
+    windows = Windows(suite.split()[0], model.options.context)
+    result: dict[str, object] = {name: value for name, value in vars(given).items() if name not in ("out", "work")}
+    known = novelties(model, course.familiar)
+    for contrast, points in course.strange.items():
+        result[f"laplace.auroc_{contrast}"] = auroc(known, novelties(model, points))
+    for weight in given.weights:
+        begin = time.perf_counter()
+        learner, prior = train(model, windows, weight, torch.Generator().manual_seed(given.seed))
+
+        def spread(points: Points) -> Tensor:
+            hidden, token = features(model, points)
+            with torch.no_grad():
+                return (learner(hidden) + weight * prior(token)).var(0).mean(-1)
+
+        familiar = spread(course.familiar).numpy()
+        for contrast, points in course.strange.items():
+            result[f"priors_{weight:g}.auroc_{contrast}"] = auroc(familiar, spread(points).numpy())
+        result[f"priors_{weight:g}.seconds"] = round(time.perf_counter() - begin, 1)
+    text = json.dumps(result, indent=2) + "\n"
+    given.out.write_text(text)
+    sys.stdout.write(text)
+
+
+if __name__ == "__main__":
+    main()
