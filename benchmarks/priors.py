@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -76,6 +77,15 @@ def train(
     return learner, prior
 
 
+@torch.no_grad()
+def spread(
+    model: EnvironmentTransformer, learner: Networks, prior: Networks, weight: float, points: Points
+) -> np.ndarray:
+    """(N,) variance over the heads, mean over the outputs."""
+    hidden, token = features(model, points)
+    return (learner(hidden) + weight * prior(token)).var(0).mean(-1).numpy()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON")
@@ -104,14 +114,10 @@ def main() -> None:
         begin = time.perf_counter()
         learner, prior = train(model, windows, weight, torch.Generator().manual_seed(given.seed))
 
-        def spread(points: Points) -> Tensor:
-            hidden, token = features(model, points)
-            with torch.no_grad():
-                return (learner(hidden) + weight * prior(token)).var(0).mean(-1)
-
-        familiar = spread(course.familiar).numpy()
+        familiar = spread(model, learner, prior, weight, course.familiar)
         for contrast, points in course.strange.items():
-            result[f"priors_{weight:g}.auroc_{contrast}"] = auroc(familiar, spread(points).numpy())
+            strange = spread(model, learner, prior, weight, points)
+            result[f"priors_{weight:g}.auroc_{contrast}"] = auroc(familiar, strange)
         result[f"priors_{weight:g}.seconds"] = round(time.perf_counter() - begin, 1)
     text = json.dumps(result, indent=2) + "\n"
     given.out.write_text(text)
