@@ -76,8 +76,6 @@ def test_members_in_one_product_equal_each_member_alone():
         mean, log_variance = alone(model, member, tokens)
         torch.testing.assert_close(means[member], mean)
         torch.testing.assert_close(log_variances[member], log_variance)
-    chosen = torch.tensor([2, 0])
-    torch.testing.assert_close(model(tokens, chosen)[0], means[chosen])
     own = torch.randn(4, 10, S + A)
     torch.testing.assert_close(model(own)[0][1], alone(model, 1, own[1])[0])
 
@@ -137,7 +135,8 @@ def test_density_and_moments_are_the_elites_mixture():
     token = model.normaliser.token(model.current(state), action)
     _, prediction = model.step(state, action, mode="sample", generator=torch.Generator().manual_seed(0))
     scale, shift = model.normaliser.target_std, F.pad(model.current(state), (0, 1))
-    members = [alone(model, member, token) for member in (3, 0, 2)]
+    every = [alone(model, member, token) for member in range(4)]
+    members = [every[member] for member in (3, 0, 2)]
     means = torch.stack([mean * scale + shift for mean, _ in members], 1)  # (B, E, S + 1)
     stds = torch.stack([torch.exp(0.5 * log_variance) * scale for _, log_variance in members], 1)
     mixture = torch.distributions.MixtureSameFamily(
@@ -148,8 +147,10 @@ def test_density_and_moments_are_the_elites_mixture():
     torch.testing.assert_close(prediction.log_prob, mixture.log_prob(outcome), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(prediction.mean, mixture.mean, rtol=1e-4, atol=1e-5)
     assert prediction.epistemic is not None and prediction.novelty is not None
+    torch.testing.assert_close(prediction.aleatoric.square(), stds.square().mean(1), rtol=1e-3, atol=1e-5)
+    spread = torch.stack([mean * scale for mean, _ in every]).var(0, correction=0)  # of all four, not the elites alone
+    torch.testing.assert_close(prediction.epistemic.square(), spread, rtol=1e-3, atol=1e-5)
     variance = prediction.aleatoric.square() + prediction.epistemic.square()
-    torch.testing.assert_close(variance, mixture.variance, rtol=1e-3, atol=1e-5)
     unit = model.normaliser.observation_std
     torch.testing.assert_close(prediction.uncertainty, (variance[:, :-1] / unit**2).mean(-1).sqrt())
     torch.testing.assert_close(prediction.novelty, (prediction.epistemic[:, :-1].square() / unit**2).mean(-1))

@@ -114,7 +114,7 @@ def _imagination(
     """Rollouts from single states by both models, and, with the transformer's cache full, their steps alone."""
     S, A, context = robot.observation_dim, robot.action_dim, options.model.context
     transformer = _frozen(EnvironmentTransformer(S, A, **vars(options.model)), device)
-    ensemble = _frozen(EnsembleDynamics(S, A, elites=7), device)  # all seven run, as in MOPO
+    ensemble = _frozen(EnsembleDynamics(S, A), device)
     actor = TanhGaussianActor(S, A).to(device)
     single, past = _histories(robot, batch, 1, device), _histories(robot, batch, context, device)
 

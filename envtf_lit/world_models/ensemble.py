@@ -1,8 +1,8 @@
 """The probabilistic ensemble of MBPO, MOPO, COMBO and RAMBO (Chua et al. 2018), as one network with a member axis.
 
 Each member is a Gaussian multilayer perceptron of its own; all of them run in one batched product per layer. The
-elites, those of least held-out error, predict together: their mixture is the predictive distribution, and where their
-means disagree, data were lacking.
+elites, those of least held-out error, predict together: their mixture is the predictive distribution. Where the means of
+all members disagree, data were lacking.
 """
 
 import itertools
@@ -42,8 +42,8 @@ class EnsembleState:
 class EnsembleDynamics(nn.Module):
     """Predicts the next state and reward from the current state and action alone.
 
-    Aleatoric variance is the mean of the elites' variances, epistemic variance that of their means: together, that of
-    the mixture. With one elite there is no epistemic estimate.
+    Mean and aleatoric variance are the elites' means of both. Epistemic variance is that of all members' means: where
+    data were lacking the worse ones disagree as well as the better ones. One member alone has no such estimate.
 
     Attributes:
         elite: (E,) int64, numbers of the members that predict.
@@ -85,22 +85,19 @@ class EnsembleDynamics(nn.Module):
         self.register_buffer("elite", torch.arange(elites))
         self.register_buffer("limit", torch.ones(()))
 
-    def forward(self, tokens: Tensor, chosen: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Means and log-variances (M, N, S + 1), in the unit scale of `normaliser.target`.
 
         Args:
             tokens: normalised inputs of each member (M, N, S + A), or of all (N, S + A).
-            chosen: (M,) numbers of the members to ask; None asks all.
         """
-        pick = (lambda parameter: parameter) if chosen is None else (lambda parameter: parameter[chosen])
-        count = self.members if chosen is None else len(chosen)
-        x = tokens if tokens.dim() == 3 else tokens.expand(count, *tokens.shape)
+        x = tokens if tokens.dim() == 3 else tokens.expand(self.members, *tokens.shape)
         *layers, (weight, bias) = zip(self.weights, self.biases, strict=True)
         for w, b in layers:
-            x = F.silu(torch.baddbmm(pick(b), x, pick(w)))  # (M, N, width)
+            x = F.silu(torch.baddbmm(b, x, w))  # (M, N, width)
         with torch.autocast(x.device.type, enabled=False):
-            mean, log_variance = torch.baddbmm(pick(bias), x.float(), pick(weight)).chunk(2, dim=-1)
-        high, low = pick(self.log_variance_max), pick(self.log_variance_min)
+            mean, log_variance = torch.baddbmm(bias, x.float(), weight).chunk(2, dim=-1)
+        high, low = self.log_variance_max, self.log_variance_min
         log_variance = high - F.softplus(high - log_variance)
         return mean, low + F.softplus(log_variance - low)
 
@@ -154,20 +151,20 @@ class EnsembleDynamics(nn.Module):
 
     @torch.no_grad()
     def fit_epistemic(self, batches: Iterable[dict[str, Tensor]], *, generator: torch.Generator) -> None:
-        """Takes the limit of novelty from training windows; nothing to do with one elite.
+        """Takes the limit of novelty from training windows; nothing to do for one member.
 
         Args:
             batches: as `loss` takes them.
             generator: not needed here: only the transformer's posterior draws anything.
         """
-        if len(self.elite) == 1:
+        if self.members == 1:
             return
         spreads = []
         for batch in batches:
             batch = {name: column.to(self.limit.device) for name, column in batch.items()}
             valid = batch["mask"].bool()
             tokens = self.normaliser.token(batch["observations"], batch["actions"])[valid]
-            epistemic = self(tokens, self.elite)[0].var(0, correction=0)
+            epistemic = self(tokens)[0].var(0, correction=0)
             spreads.append(self.normaliser.uncertainty(epistemic).square())
         self.limit.copy_(quantile(torch.cat(spreads), OUTSIDE))
 
@@ -198,9 +195,10 @@ class EnsembleDynamics(nn.Module):
         self, state: EnsembleState, action: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None
     ) -> tuple[EnsembleState, Prediction]:
         """See `WorldModel.step`. A sample follows one elite, drawn for each row at each step unless the row has one."""
-        means, log_variances = self(self.normaliser.token(state.observation, action), self.elite)  # (E, B, S + 1)
+        outputs = self(self.normaliser.token(state.observation, action))  # each (M, B, S + 1)
+        epistemic = outputs[0].var(0, correction=0) if self.members > 1 else None
+        means, log_variances = (output[self.elite] for output in outputs)  # (E, B, S + 1)
         mean, aleatoric = means.mean(0), log_variances.exp().mean(0)
-        epistemic = means.var(0, correction=0) if len(means) > 1 else None
         variance = aleatoric if epistemic is None else aleatoric + epistemic
         value = self._value(state, means, log_variances, mode, generator)
         outcome, scale = self.normaliser.outcome(state.observation, value), self.normaliser.target_std
