@@ -78,6 +78,7 @@ def main() -> None:
     base = work / f"base-{options.base_updates}" / "published"
     scratch = fit(work / f"scratch-{options.updates}", data, options.updates, options.every, options)
     updates = options.tuned_updates or options.updates // 4
+    short = fit(work / f"scratch-{updates}", data, updates, options.every, options)
     flags = {"init_from": base, "freeze": options.freeze, "options.learning_rate": options.learning_rate}
     parts = "-".join(options.freeze.strip("[]").replace(" ", "").split(","))
     run = work / f"tuned-{updates}-{options.learning_rate:g}-{parts}"
@@ -93,6 +94,7 @@ def main() -> None:
         "tuned_updates_to_scratch_error": int(reached[0]) if len(reached) else None,
         "share_of_updates": float(reached[0] / scratch.idxmin()) if len(reached) else None,
         "tuned_error": float(tuned.min()),
+        "short_scratch_error": float(short.min()),  # with the fine-tuned run's updates and schedule, without its start
         "scratch_curve": {int(update): float(error) for update, error in scratch.items()},
         "tuned_curve": {int(update): float(error) for update, error in tuned.items()},
         **{name: value for name, value in vars(options).items() if name not in ("out", "work")},

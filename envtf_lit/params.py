@@ -134,7 +134,8 @@ class GenerateRolloutsOptions:
         branches: rollouts, each from a dataset state drawn at random.
         horizon: steps of each rollout, unless the robot falls first.
         history: real steps given to the model before the branch point, at most `context - 1`.
-        share: rollouts that begin within as many consecutive steps of one window, which the model reads once.
+        share: rollouts that begin within as many consecutive steps of one window, which the model reads once; they
+            have up to `share - 1` steps more behind them.
         exploration: scale of the Gaussian noise added to the clone's sampled actions, in units of the action range's
             half.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
@@ -195,8 +196,8 @@ class ImaginationOptions:
         tail: deterministic steps after the horizon, which are not learned from but whose rewards, and end, enter the
             targets of the steps before them (model-based value expansion, Feinberg et al. 2018).
         history: real steps given to the model before the branch point.
-        share: rollouts that begin within as many consecutive steps of one window, which the model reads once: it pays
-            where rollouts are short.
+        share: rollouts that begin within as many consecutive steps of one window, which the model reads once, with up
+            to `share - 1` steps more behind them: it pays where rollouts are short.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
         posterior: above zero each rollout runs in a world model of its own, drawn from the posterior of the last layer
             with its deviation from the mean times this.

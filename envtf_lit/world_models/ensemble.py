@@ -1,8 +1,8 @@
 """The probabilistic ensemble of MBPO, MOPO, COMBO and RAMBO (Chua et al. 2018), as one network with a member axis.
 
 Each member is a Gaussian multilayer perceptron of its own; all of them run in one batched product per layer. The
-elites, those of least held-out error, predict together: their mixture is the predictive distribution. Where the means of
-all members disagree, data were lacking.
+elites, those of least held-out error, predict together: their mixture is the predictive distribution. Where the means
+of all members disagree, data were lacking.
 """
 
 import itertools
