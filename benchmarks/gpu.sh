@@ -3,7 +3,7 @@
 #
 # The most valuable comes first, and each result is kept in FOLDER (default: benchmarks/gpu) as soon as it is there, with
 # device and versions inside; machine.txt holds `envtf doctor`, and a .log lies beside each result. What fails or runs
-# out of time is named at the end.
+# out of time is named at the end; what it had measured by then lies in FOLDER/work.
 #
 #   MINUTES=10 benchmarks/gpu.sh                  less time
 #   QUICK=1 benchmarks/gpu.sh /tmp/try            every part on budgets of seconds, on any machine: a rehearsal
@@ -17,7 +17,13 @@ begin=$SECONDS
 failed=()
 mkdir -p "$out"
 work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
+trap 'keep; rm -rf "$work"' EXIT
+
+# keep: saves what was measured of each model, in FOLDER/work: of a comparison that ran out of time nothing else is left
+keep() {
+  mkdir -p "$out/work"
+  (cd "$work" && find . -name '*.json' -print0 | tar -c --null -T -) | tar -x -C "$out/work"
+}
 
 # measure NAME COMMAND…: runs `envtf COMMAND… --out FOLDER/NAME.json` within the time that is left
 measure() {
@@ -33,6 +39,7 @@ measure() {
   else
     failed+=("$name (see $out/$name.log)")
   fi
+  keep
 }
 
 small=(--rounds 5)

@@ -33,7 +33,7 @@ def compare(
     """Trains the suite's models on robots with hidden dynamics, and measures them on draws that none has seen.
 
     Args:
-        out: JSON file; the figure lies beside it as PNG, its numbers as CSV.
+        out: JSON file to write after each robot; the figure lies beside it as PNG, its numbers as CSV.
         robots: names.
         tier: of the data that models are trained and measured on.
         work: folder of suites; what was trained there before with the same options is used again.
@@ -63,8 +63,8 @@ def compare(
             metrics[f"{robot}.{name}"] = value
             if isinstance(value, float):
                 report(f"{robot}.{name}: {value:.3g}")
-    write_json(out, metrics)
-    recognition_curves(found, out.with_suffix(".png"))
+        write_json(out, metrics)
+        recognition_curves(found, out.with_suffix(".png"))
     return metrics
 
 

@@ -63,7 +63,7 @@ def compare(
     """Measures every model on every robot; what an interrupted call has measured is kept below `work`.
 
     Args:
-        out: JSON file; a table `.md` and a folder of figures, of the same name, lie beside it.
+        out: JSON file to write after each robot; a table `.md` and a folder of figures of that name lie beside it.
         robots: names.
         tier: of the data that models are trained and measured on.
         work: folder of suites; what was trained or measured there before with the same options is used again.
@@ -104,10 +104,10 @@ def compare(
             found[robot][name] = course.measure(name, folder)
             clock.done(name, f"{robot}: {name}: {_headline(found[robot][name][RECORDED].numbers)}")
         numbers |= {f"{robot}.{name}.train_seconds": value for name, value in built.seconds.items()}
-    numbers |= flat_numbers(found)
-    write_json(out, numbers)
-    write_text(out.with_suffix(".md"), page(found, tier))
-    draw(found, out.with_suffix(""))
+        numbers |= flat_numbers({robot: found[robot]})
+        write_json(out, numbers)
+        write_text(out.with_suffix(".md"), page(found, tier))
+        draw(found, out.with_suffix(""))
     return numbers
 
 

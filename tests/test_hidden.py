@@ -13,7 +13,7 @@ from PIL import Image
 from envtf_lit import hidden
 from envtf_lit.errors import UserError
 from envtf_lit.params import EnsembleOptions
-from envtf_lit.suite import MODELS, SuiteOptions
+from envtf_lit.suite import MODELS, Suite, SuiteOptions, build_suite
 
 ENSEMBLE = EnsembleOptions(
     members=2, elites=1, hidden=(8,), weight_decay=(0.0, 0.0), updates=2, updates_per_epoch=2, batch_size=8
@@ -47,6 +47,16 @@ def test_models_are_measured_on_draws_that_none_has_seen(tmp_path: Path, monkeyp
     made = unseen.stat().st_mtime_ns
     again = hidden.compare(tmp_path / "again.json", robots=["hopper"], report=lines.append, **facts)
     assert again == metrics and unseen.stat().st_mtime_ns == made
+
+    def build(task: str, *arguments: Any, **options: Any) -> Suite:
+        if task != "hopper-medium-hidden":
+            raise KeyboardInterrupt
+        return build_suite(task, *arguments, **options)
+
+    monkeypatch.setattr(hidden, "build_suite", build)
+    with pytest.raises(KeyboardInterrupt):
+        hidden.compare(tmp_path / "part.json", robots=["hopper", "walker2d"], report=lines.append, **facts)
+    assert json.loads((tmp_path / "part.json").read_text()) == metrics and (tmp_path / "part.png").exists()
 
 
 def test_unknown_names_are_refused_before_any_work(tmp_path: Path) -> None:

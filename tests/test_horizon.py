@@ -9,13 +9,13 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from envtf_lit import tasks
+from envtf_lit import horizon, tasks
 from envtf_lit.cli import main
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation import tracking
 from envtf_lit.horizon import ONLINE, SIZES, HorizonOptions, compare
 from envtf_lit.params import EnsembleOptions
-from envtf_lit.suite import MODELS, SuiteOptions
+from envtf_lit.suite import MODELS, Suite, SuiteOptions, build_suite
 from envtf_lit.tasks import ROBOTS, Task
 
 ENSEMBLE = EnsembleOptions(
@@ -70,6 +70,21 @@ def test_every_model_is_measured_once_and_all_of_it_is_written(tmp_path: Path) -
     assert numbers.items() <= again.items()
     assert again["hopper.mine.open_loop_0.1"] == numbers["hopper.ensemble.open_loop_0.1"]
     assert kept == {path: path.stat().st_mtime_ns for path in kept}
+
+
+@pytest.mark.usefixtures("short_episodes")
+def test_what_was_measured_is_written_before_the_next_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def build(task: str, *arguments: Any, **options: Any) -> Suite:
+        if task != "hopper-medium":
+            raise KeyboardInterrupt
+        return build_suite(task, *arguments, **options)
+
+    monkeypatch.setattr(horizon, "build_suite", build)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, [], robots=["hopper", "walker2d"], models=["context_1"])
+    assert "hopper.context_1.open_loop_0.1" in json.loads((tmp_path / "out/horizon.json").read_text())
+    assert "| hopper | context_1 |" in (tmp_path / "out/horizon.md").read_text()
+    assert (tmp_path / "out/horizon/ceiling.png").exists()
 
 
 @pytest.mark.parametrize(

@@ -289,3 +289,19 @@ def test_a_built_wheel_brings_the_project_template(tmp_path: Path) -> None:
     assert (tmp_path / "new/data/dataset.h5").is_file()
     call("envtf", "zoo", "build", "ant-medium", "--transitions", "200", "--workers", "1", "--quiet")
     assert "Ant-v5" in (tmp_path / "data/zoo/ant-medium.md").read_text()
+
+
+def test_a_gpu_run_that_fails_keeps_what_it_had_measured(tmp_path: Path) -> None:
+    envtf = tmp_path / "envtf.sh"
+    measured = "hopper-medium/.envtf/runs/calibration.json"
+    envtf.write_text(
+        'work=$(sed -n "s/.*--work \\([^ ]*\\).*/\\1/p" <<<"$*")\n'
+        f'[[ -z $work ]] || (mkdir -p "$work/{Path(measured).parent}" && echo {{}} >"$work/{measured}")\n'
+        "[[ $1 != calibrate ]]\n"
+    )
+    command = ["bash", "benchmarks/gpu.sh", str(tmp_path / "out")]
+    env = os.environ | {"ENVTF": f"bash {envtf}", "TMPDIR": str(tmp_path)}
+    result = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
+    assert result.returncode == 1 and "not measured: calibrate" in result.stderr
+    assert (tmp_path / "out/work" / measured).read_text() == "{}\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"envtf.sh", "out"}  # the work folder is gone
