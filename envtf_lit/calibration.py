@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +28,12 @@ from envtf_lit.evaluation.physics import Physics
 from envtf_lit.evaluation.returns import SEED_OFFSET
 from envtf_lit.figures.calibration import calibration_page
 from envtf_lit.storage import pick_device, write_json, write_text
-from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite, flat_settings, kept
+from envtf_lit.suite import MODELS, WORK, Suite, SuiteOptions, build_suite, flat_settings, kept, other_folders
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.world_models.horizon import Scale, forecast, whole_episodes
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.store import load_world_model
 
-MODELS = ("transformer", "ensemble")  # those with an epistemic variance that are compared
 CONTRASTS = ("expert", "random_policy", "random_action")  # what is strange to a model of medium data
 LEVELS = (0.05, *(k / 10 for k in range(1, 10)), 0.95)  # at which coverage is drawn
 PARTS = 20  # of a rollout's steps in order of u, at which errors are drawn
@@ -63,15 +63,18 @@ class CalibrationOptions:
 
 @dataclass(frozen=True)
 class Findings:
-    """What is reported of one robot.
+    """What is reported of one model on one robot.
 
     Attributes:
         numbers: by name; docs/calibration.md explains them.
-        curves: what the figure shows, by model.
+        curves: what the figure shows.
     """
 
     numbers: dict[str, float]
-    curves: dict[str, Curves]
+    curves: Curves
+
+
+Results = dict[str, Findings]  # of a robot, by model
 
 
 def compare(
@@ -82,10 +85,11 @@ def compare(
     work: Path = WORK,
     options: SuiteOptions,
     measured: CalibrationOptions = CalibrationOptions(),
+    others: Mapping[str, str] | None = None,
     progress: bool = True,
     report: Callable[[str], None] = print,
 ) -> dict[str, Any]:
-    """Measures transformer and ensemble on every robot; what an interrupted call measured is kept below `work`.
+    """Measures every model on every robot; what an interrupted call has measured is kept below `work`.
 
     Args:
         out: JSON file to write after each robot, with flat keys; a table `.md` and a figure `.png` appear beside it.
@@ -94,6 +98,7 @@ def compare(
         work: where datasets, models and results are kept, as `build_suite` has it.
         options: how the models are trained.
         measured: what is measured of them.
+        others: further models, name to folder; `{task}` and `{robot}` in a folder stand for those names.
         progress: shows bars.
         report: called with a line for each robot.
 
@@ -101,57 +106,63 @@ def compare(
         What `out` holds.
 
     Raises:
-        UserError: an unknown robot or tier.
+        UserError: an unknown robot or tier, a folder without a world model of the robot, or a name that is taken.
     """
     tasks = [get_task(f"{robot}-{tier}") for robot in dict.fromkeys(robots)]
+    further = other_folders(others or {}, tasks)
     torch.set_num_threads(options.threads)
-    found: dict[str, Findings] = {}
+    found: dict[str, Results] = {}
     numbers = flat_settings(tier, options, calibration=measured)
     for task in tasks:
         name = task.robot.name
-        built = build_suite(task.name, work, options, models=MODELS, progress=progress)
-        found[name] = _kept(task, built, work / task.name, measured, progress)
-        numbers |= {f"{name}.{key}": value for key, value in found[name].numbers.items()}
+        built = build_suite(task.name, work, options, progress=progress)
+        found[name] = measure(task, built, work / task.name, measured, others=further[task.name], progress=progress)
+        numbers |= flat_numbers({name: found[name]})
         write_json(out, numbers)
         write_text(out.with_suffix(".md"), page(found, tier))
-        calibration_page({robot: findings.curves for robot, findings in found.items()}, out.with_suffix(".png"))
-        report(f"{name}: {_headline(found[name].numbers)} ({len(found)} of {len(tasks)})")
+        curves = {robot: {model: one.curves for model, one in results.items()} for robot, results in found.items()}
+        calibration_page(curves, out.with_suffix(".png"))
+        report(f"{name}: {_headline(found[name])} ({len(found)} of {len(tasks)})")
     return numbers
 
 
-def _kept(task: Task, suite: Suite, home: Path, options: CalibrationOptions, progress: bool) -> Findings:
-    """A robot's findings, now or when they were measured of the same models."""
-
-    def timed() -> dict[str, Any]:
-        begin = time.perf_counter()
-        findings = measure(task, suite, options, progress=progress)
-        findings.numbers["seconds"] = round(time.perf_counter() - begin, 1)
-        return asdict(findings)
-
-    settings = flat_settings(task.tier, suite.options, calibration=options)
-    return Findings(**kept(home, "calibration", settings, [suite.dataset, *suite.folders.values()], timed))
-
-
-def measure(task: Task, suite: Suite, options: CalibrationOptions, *, progress: bool = True) -> Findings:
+def measure(
+    task: Task, suite: Suite, home: Path, options: CalibrationOptions, *, others: Mapping[str, Path], progress: bool
+) -> Results:
     """Everything about one robot's models, on the same episodes, pairs and first states for each.
 
     Args:
         task: robot and tier that the models were trained on.
-        suite: the models.
+        suite: data and models.
+        home: below it lies what was measured before of the same models.
         options: what is measured.
+        others: folders of further models, by name.
         progress: shows bars while strange data are collected.
     """
-    course = Course(task, suite, options, progress)
-    findings = Findings({}, {})
-    for name in MODELS:
-        model = load_world_model(suite.folders[name]).to(course.device)
-        for part in (course.intervals, course.detection, course.rollouts):
-            numbers, curves = part(model)
-            findings.numbers.update({f"{name}.{key}": value for key, value in numbers.items()})
-            findings.curves.setdefault(name, {}).update(curves)
-    for level in (50, 90):  # of the model that this package is about
-        findings.numbers[f"coverage_{level}"] = findings.numbers[f"{MODELS[0]}.coverage_{level}"]
-    return findings
+    course = cache(partial(Course, task, suite, options, progress))
+    settings = flat_settings(task.tier, suite.options, calibration=options)
+
+    def one(folder: Path) -> dict[str, Any]:
+        place = course()
+        begin = time.perf_counter()
+        findings = place.measure(load_world_model(folder).to(place.device))
+        return asdict(findings) | {"numbers": findings.numbers | {"seconds": round(time.perf_counter() - begin, 1)}}
+
+    return {
+        name: Findings(**kept(home, f"calibration-{name}", settings, [suite.dataset, folder], partial(one, folder)))
+        for name, folder in (suite.folders | dict(others)).items()
+    }
+
+
+def flat_numbers(found: Mapping[str, Results]) -> dict[str, float]:
+    """`robot.model.name`, and `robot.coverage_50` and `_90` of the model that this package is about."""
+    numbers = {}
+    for robot, results in found.items():
+        for model, findings in results.items():
+            numbers |= {f"{robot}.{model}.{name}": value for name, value in findings.numbers.items()}
+        for level in (50, 90):
+            numbers[f"{robot}.coverage_{level}"] = results[MODELS[0]].numbers[f"coverage_{level}"]
+    return numbers
 
 
 class Course:
@@ -192,6 +203,15 @@ class Course:
         self.starts, self.physics = pairs(held_out, options.rollouts, stream=1), Physics(task.robot)
         self.expert = load_snapshot(series, series.expert.steps).to(self.device)
 
+    def measure(self, model: WorldModel) -> Findings:
+        """All of one model."""
+        findings = Findings({}, {})
+        for part in (self.intervals, self.detection, self.rollouts):
+            numbers, curves = part(model)
+            findings.numbers.update(numbers)
+            findings.curves.update(curves)
+        return findings
+
     def intervals(self, model: WorldModel) -> Measured:
         """Coverage on held-out episodes."""
         taught = forecast(model, self.episodes, feedback="recorded")
@@ -200,11 +220,13 @@ class Course:
         return {f"coverage_{level}": covered[level] for level in (50, 90)}, {"coverage": curve}
 
     def detection(self, model: WorldModel) -> Measured:
-        """Strange pairs against familiar ones, by epistemic variance."""
+        """Strange pairs against familiar ones, by epistemic variance; nothing of a model that has none."""
         known = novelties(model, self.familiar.to(self.device))
         numbers, curves = {}, {}
         for contrast, points in self.strange.items():
             scores = novelties(model, points.to(self.device))
+            if known is None or scores is None:
+                continue
             numbers[f"auroc_{contrast}"] = auroc(known, scores)
             false, true = roc_curve(known, scores)
             curves[f"roc_{contrast}"] = {"false": false.tolist(), "true": true.tolist()}
@@ -225,15 +247,18 @@ def _quantiles(uncertainty: np.ndarray, error: np.ndarray) -> dict[str, list[flo
     return dict(zip(("uncertainty", "lower", "median", "upper"), np.transpose(rows).tolist(), strict=True))
 
 
-def _headline(numbers: Mapping[str, float]) -> str:
-    areas = (
-        f"{numbers[f'transformer.auroc_{name}']:.2f} ({numbers[f'ensemble.auroc_{name}']:.2f})" for name in CONTRASTS
-    )
+def _headline(results: Results) -> str:
+    ours, theirs = (results[name].numbers for name in ("transformer", "ensemble"))
+    areas = (f"{_shown(ours, f'auroc_{name}', 2)} ({_shown(theirs, f'auroc_{name}', 2)})" for name in CONTRASTS)
     return (
-        f"50 % intervals hold {numbers['coverage_50']:.1%}, 90 % intervals {numbers['coverage_90']:.1%}; AUROC (the "
-        f"ensemble's) {', '.join(areas)}; rank correlation {numbers['transformer.rank_correlation']:.2f} "
-        f"({numbers['ensemble.rank_correlation']:.2f})"
+        f"50 % intervals hold {ours['coverage_50']:.1%}, 90 % intervals {ours['coverage_90']:.1%}; AUROC (the "
+        f"ensemble's) {', '.join(areas)}; rank correlation {ours['rank_correlation']:.2f} "
+        f"({theirs['rank_correlation']:.2f})"
     )
+
+
+def _shown(numbers: Mapping[str, float], name: str, digits: int = 3) -> str:
+    return f"{numbers[name]:.{digits}f}" if name in numbers else "–"
 
 
 HEAD = (
@@ -241,13 +266,13 @@ HEAD = (
 )  # fmt: skip
 
 
-def page(found: Mapping[str, Findings], tier: str) -> str:
+def page(found: Mapping[str, Results], tier: str) -> str:
     """The table in Markdown."""
     names = ("coverage_50", "coverage_90", *(f"auroc_{name}" for name in CONTRASTS), "rank_correlation")
     rows = [
-        (robot, model, *(f"{findings.numbers[f'{model}.{name}']:.3f}" for name in names))
-        for robot, findings in found.items()
-        for model in MODELS
+        (robot, model, *(_shown(findings.numbers, name) for name in names))
+        for robot, results in found.items()
+        for model, findings in results.items()
     ]
     words = "Share of held-out outcomes in each interval; AUROC of each contrast; rank correlation."
     return f"## Models of {tier} data\n\n{words}\n\n{markdown_table(HEAD, rows)}\n"

@@ -192,13 +192,7 @@ def _add_horizon(commands: Any) -> None:
     horizon.add_argument(
         "--start", type=_natural, default=0, metavar="N", help="steps of each episode to leave out; default: 0"
     )
-    horizon.add_argument(
-        "--model",
-        action="append",
-        default=[],
-        metavar="NAME=FOLDER",
-        help="a further world model; {task} and {robot} in the folder stand for their names; may be repeated",
-    )
+    _add_models(horizon)
     _add_suite(horizon, context=16)
 
 
@@ -210,7 +204,18 @@ def _add_calibrate(commands: Any) -> None:
     )
     calibrate.add_argument("--robots", nargs="+", default=ROBOT_NAMES, choices=ROBOT_NAMES, help="default: all four")
     calibrate.add_argument("--tier", default="medium", help="of the data; default: medium")
+    _add_models(calibrate)
     _add_suite(calibrate, context=16)
+
+
+def _add_models(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--model",
+        action="append",
+        default=[],
+        metavar="NAME=FOLDER",
+        help="a further world model; {task} and {robot} in the folder stand for their names; may be repeated",
+    )
 
 
 def _add_bench(commands: Any) -> None:
@@ -416,21 +421,25 @@ def _horizon(namespace: argparse.Namespace, rest: list[str]) -> None:
     compare(
         **_comparison(namespace),
         measured=HorizonOptions(namespace.trajectories, namespace.online, namespace.start),
-        others=dict(_named_folder(text) for text in namespace.model),
+        others=_named_folders(namespace),
     )
 
 
 def _calibrate(namespace: argparse.Namespace, rest: list[str]) -> None:
     from envtf_lit.calibration import compare
 
-    compare(**_comparison(namespace))
+    compare(**_comparison(namespace), others=_named_folders(namespace))
 
 
-def _named_folder(text: str) -> tuple[str, str]:
-    name, equals, folder = text.partition("=")
-    if not (name and equals and folder):
-        raise UserError(f"--model {text!r} has no name and folder: write --model NAME=FOLDER.")
-    return name, folder
+def _named_folders(namespace: argparse.Namespace) -> dict[str, str]:
+    """What the options `--model` say."""
+    found = dict[str, str]()
+    for text in namespace.model:
+        name, _, folder = text.partition("=")
+        if not (name and folder):
+            raise UserError(f"--model {text!r} has no name and folder: write --model NAME=FOLDER.")
+        found[name] = folder
+    return found
 
 
 def _bench_model(namespace: argparse.Namespace, rest: list[str]) -> None:

@@ -18,7 +18,17 @@ from envtf_lit.evaluation.returns import SEED_OFFSET
 from envtf_lit.evaluation.tracking import Tracking, fresh_episodes, track, track_ceiling, track_sampled
 from envtf_lit.figures import horizons
 from envtf_lit.storage import pick_device, write_json, write_text
-from envtf_lit.suite import MODELS, WORK, Suite, SuiteOptions, build_suite, flat_settings, kept
+from envtf_lit.suite import (
+    MODELS,
+    PHYSICS,
+    WORK,
+    Suite,
+    SuiteOptions,
+    build_suite,
+    flat_settings,
+    kept,
+    other_folders,
+)
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.training import run_folder
 from envtf_lit.world_models.horizon import THRESHOLDS, Scale, Trajectories, whole_episodes
@@ -27,7 +37,7 @@ from envtf_lit.world_models.store import load_world_model
 ONLINE = ("random", "medium", "expert")  # policies of the zoo that drive MuJoCo
 SIZES = (1e-4, 1e-3, 1e-2, 1e-1)  # of disturbances, at which the ceiling is drawn
 RECORDED = "recorded"  # the tier's own episodes
-PHYSICS, SUITE, EPISODES = "physics", "suite", "episodes"  # parts of the work, beside the models
+SUITE, EPISODES = "suite", "episodes"  # parts of the work, beside physics and the models
 
 Results = dict[str, dict[str, Tracking]]  # of a robot, by model and source of the episodes
 
@@ -81,26 +91,23 @@ def compare(
         UserError: an unknown robot or tier, too few episodes, a folder without a world model of the robot, or a name
             that is taken.
     """
-    tasks, others = [get_task(f"{robot}-{tier}") for robot in dict.fromkeys(robots)], dict(others or {})
-    for name in others:
-        if name in (*MODELS, PHYSICS) or "." in name:
-            raise UserError(f"A model cannot be called {name!r} here: choose a name of your own, without dots.")
+    tasks = [get_task(f"{robot}-{tier}") for robot in dict.fromkeys(robots)]
+    further = other_folders(others or {}, tasks)
     if min(measured.trajectories, measured.online) < 1:
         raise UserError("A length is a mean over at least one trajectory: ask for more than none.")
     torch.set_num_threads(options.threads)
-    clock = _Clock([SUITE, EPISODES, PHYSICS, *models, *others], len(tasks), report)
+    clock = _Clock([SUITE, EPISODES, PHYSICS, *models, *(others or {})], len(tasks), report)
     found: dict[str, Results] = {}
     numbers = flat_settings(tier, options, measured=measured)
     for task in tasks:
         robot = task.robot.name
         built = build_suite(task.name, work, options, models=models, progress=progress)
         clock.done(SUITE, f"{robot}: dataset and models")
-        folders = built.folders | {name: _filled(folder, task) for name, folder in others.items()}
         course = _Course(task, built, work / task.name, measured, progress)
         clock.done(EPISODES, f"{robot}: {course.episodes} fresh episodes")
         found[robot] = {PHYSICS: course.measure_physics()}
         clock.done(PHYSICS, f"{robot}: the ceiling set by physics")
-        for name, folder in folders.items():
+        for name, folder in (built.folders | further[task.name]).items():
             found[robot][name] = course.measure(name, folder)
             clock.done(name, f"{robot}: {name}: {_headline(found[robot][name][RECORDED].numbers)}")
         numbers |= {f"{robot}.{name}.train_seconds": value for name, value in built.seconds.items()}
@@ -109,10 +116,6 @@ def compare(
         write_text(out.with_suffix(".md"), page(found, tier))
         draw(found, out.with_suffix(""))
     return numbers
-
-
-def _filled(folder: str, task: Task) -> Path:
-    return Path(folder.replace("{task}", task.name).replace("{robot}", task.robot.name))
 
 
 def _headline(numbers: Mapping[str, float]) -> str:
@@ -157,7 +160,7 @@ class _Course:
     """
 
     def __init__(self, task: Task, suite: Suite, home: Path, measured: HorizonOptions, progress: bool) -> None:
-        self.robot, self.home, self.dataset = task.robot, home, suite.dataset
+        self.home, self.dataset = home, suite.dataset
         self.seed, self.start = suite.options.seed, measured.start
         self.device = pick_device()
         self.key = flat_settings(task.tier, suite.options, measured=measured)
@@ -191,9 +194,7 @@ class _Course:
 
     def measure(self, name: str, folder: Path) -> dict[str, Tracking]:
         """A model's results by source of the episodes; the recorded ones with ceilings at its own one-step error."""
-        model, robot = load_world_model(folder).to(self.device), self.robot
-        if (model.observation_dim, model.action_dim) != (robot.observation_dim, robot.action_dim):
-            raise UserError(f"{folder} holds a world model of another robot: give one of {robot.name}.")
+        model = load_world_model(folder).to(self.device)
 
         def work() -> dict[str, Tracking]:
             found = {source: track(model, episodes, self.scale) for source, episodes in self.trajectories.items()}

@@ -6,7 +6,7 @@ measured of these three, and models that lie there already, trained with the sam
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
@@ -22,12 +22,14 @@ from envtf_lit.data.formats import load_dataset
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.params import DownloadOptions, EnsembleOptions, ModelOptions, Params, Precision, TrainModelOptions
 from envtf_lit.storage import read_json, write_json
-from envtf_lit.tasks import Robot, get_task
+from envtf_lit.tasks import Robot, Task, get_task
 from envtf_lit.training import run_folder
 from envtf_lit.validation import check_ranges, check_world_model
 from envtf_lit.world_models.recalibration import calibration_split
+from envtf_lit.world_models.store import load_world_model
 
 MODELS = ("transformer", "context_1", "ensemble")  # their names in every table, figure and file
+PHYSICS = "physics"  # what stands beside them under that name, so that no other model may have it
 WORK = Path(".envtf/suite")  # where suites are kept unless told otherwise
 
 
@@ -111,6 +113,31 @@ def kept(home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path]
     if not place.exists():
         write_json(place, measure())
     return read_json(place)
+
+
+def other_folders(others: Mapping[str, str], tasks: Sequence[Task]) -> dict[str, dict[str, Path]]:
+    """Folders of models that are none of the suite's, by task and name; each is read, so that none fails hours later.
+
+    Args:
+        others: name to folder; `{task}` and `{robot}` in a folder stand for those names.
+        tasks: that the models are compared on.
+
+    Raises:
+        UserError: a name that is taken or holds a dot, or a folder without a world model of the robot.
+    """
+    for name in others:
+        if name in (*MODELS, PHYSICS) or "." in name:
+            raise UserError(f"A model cannot be called {name!r} here: choose a name of your own, without dots.")
+    return {task.name: {name: _folder_of(folder, task) for name, folder in others.items()} for task in tasks}
+
+
+def _folder_of(pattern: str, task: Task) -> Path:
+    """The task's folder, which holds a model of its robot."""
+    folder, robot = Path(pattern.replace("{task}", task.name).replace("{robot}", task.robot.name)), task.robot
+    model = load_world_model(folder)
+    if (model.observation_dim, model.action_dim) != (robot.observation_dim, robot.action_dim):
+        raise UserError(f"{folder} holds a world model of another robot: give one of {robot.name}.")
+    return folder
 
 
 def build_suite(

@@ -1,6 +1,7 @@
 """`envtf calibrate` from end to end: tiny models of a real robot, numbers, table and figure, and what is kept."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,10 @@ import pytest
 from PIL import Image
 
 from envtf_lit import calibration
-from envtf_lit.calibration import CONTRASTS, MODELS, CalibrationOptions
+from envtf_lit.calibration import CONTRASTS, CalibrationOptions
 from envtf_lit.errors import UserError
 from envtf_lit.params import EnsembleOptions
-from envtf_lit.suite import SuiteOptions
+from envtf_lit.suite import MODELS, SuiteOptions, add_model, build_suite, model_params
 
 ENSEMBLE = EnsembleOptions(
     members=3, elites=2, hidden=(8,), weight_decay=(0.0, 0.0), updates=4, updates_per_epoch=2, batch_size=8
@@ -25,7 +26,7 @@ FEW = CalibrationOptions(points=50, strange_rows=500, episodes=2, rollouts=5, ro
 def test_models_are_measured_once_and_drawn(tmp_path: Path) -> None:
     lines = list[str]()
     facts: dict[str, Any] = dict(robots=["hopper"], work=tmp_path, options=TINY, measured=FEW, progress=False)
-    run = lambda out: calibration.compare(tmp_path / out, report=lines.append, **facts)  # noqa: E731
+    run = lambda out, **more: calibration.compare(tmp_path / out, report=lines.append, **facts, **more)  # noqa: E731
     numbers = run("out/calibration.json")
     assert json.loads((tmp_path / "out/calibration.json").read_text()) == numbers
     names = ("coverage_50", "coverage_90", "rank_correlation", *(f"auroc_{name}" for name in CONTRASTS))
@@ -37,15 +38,27 @@ def test_models_are_measured_once_and_drawn(tmp_path: Path) -> None:
         assert figure.size[0] > 1_200
     table = pd.read_csv(tmp_path / "out/calibration.csv")
     assert set(table["panel"]) == {"coverage", "errors", *(f"roc_{name}" for name in CONTRASTS)}
-    assert (tmp_path / "out/calibration.md").read_text().count("| hopper |") == 2
+    assert (tmp_path / "out/calibration.md").read_text().count("| hopper |") == len(MODELS)
 
-    (kept,) = (tmp_path / "hopper-medium/.envtf/runs").glob("calibration-*.json")
-    written = kept.stat().st_mtime_ns
-    assert run("again.json") == numbers  # the seconds, too: nothing was measured again
-    assert kept.stat().st_mtime_ns == written
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("calibration-*.json")}
+    assert len(kept) == len(MODELS)
+    plain = model_params("transformer", "hopper-medium", TINY).train_model
+    suite = build_suite("hopper-medium", tmp_path, TINY, progress=False)
+    add_model(suite, "certain", replace(plain, model=replace(plain.model, epistemic="none")), progress=False)
+    again = run("again.json", others={"certain": str(tmp_path / "{task}/models/certain")})
+    assert numbers.items() <= again.items()  # the seconds, too: nothing was measured again
+    assert kept == {path: path.stat().st_mtime_ns for path in kept}
+    found = {key.split(".")[2] for key in again if key.startswith("hopper.certain.")}
+    assert found & set(names) == {"coverage_50", "coverage_90", "rank_correlation"}  # novelty it has none
+    assert "| hopper | certain |" in (tmp_path / "again.md").read_text()
+    assert "certain" in set(pd.read_csv(tmp_path / "again.csv")["model"])
 
 
 def test_unknown_names_are_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="hopper-meduim"):
         calibration.compare(tmp_path / "c.json", robots=["hopper"], tier="meduim", work=tmp_path, options=TINY)
+    with pytest.raises(UserError, match="no/hopper is not a model folder"):
+        calibration.compare(
+            tmp_path / "c.json", robots=["hopper"], work=tmp_path, options=TINY, others={"mine": "no/{robot}"}
+        )
     assert list(tmp_path.iterdir()) == []

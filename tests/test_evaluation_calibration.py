@@ -154,9 +154,9 @@ def test_novelty_is_that_of_the_last_token_after_the_true_past():
         hidden, _ = model.encode(points.observations, actions, cached=False)
         expected = model.laplace.leverage(hidden[:, -1]) / model.laplace.limit
     found = novelties(model, points, batch_size=3)
+    assert found is not None
     np.testing.assert_allclose(found, expected.numpy(), rtol=1e-4)
-    with pytest.raises(UserError, match="no epistemic variance"):
-        novelties(make_model(epistemic="none"), points)
+    assert novelties(make_model(epistemic="none"), points) is None
 
 
 # errors along rollouts

@@ -13,7 +13,7 @@ from PIL import Image
 
 from envtf_lit.evaluation.returns import Episode, Returns
 from envtf_lit.figures import gallery, learning
-from envtf_lit.figures.style import drawing, featured, observation_labels
+from envtf_lit.figures.style import COLOURS, drawing, featured, model_looks, observation_labels
 from envtf_lit.tasks import ROBOTS
 from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
 
@@ -125,3 +125,9 @@ def test_other_robots_have_numbered_labels():
     assert observation_labels(None, 2) == ["s[0]", "s[1]"]
     assert featured(1) == [0]
     assert featured(2) == [0, 1]
+
+
+def test_models_of_no_colour_of_their_own_are_told_apart() -> None:
+    looks = model_looks(["transformer", *(f"remedy_{i}" for i in range(11))])
+    assert looks["transformer"].colour == COLOURS["transformer"] and looks["remedy_3"].label == "remedy_3"
+    assert len({(look.colour, str(look.line), look.marker) for look in looks.values()}) == 12

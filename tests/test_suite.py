@@ -9,8 +9,10 @@ import pytest
 from envtf_lit import load_world_model
 from envtf_lit.errors import UserError
 from envtf_lit.params import EnsembleOptions, ModelOptions, TrainModelOptions
-from envtf_lit.suite import MODELS, SuiteOptions, add_model, build_suite
+from envtf_lit.suite import MODELS, SuiteOptions, add_model, build_suite, other_folders
+from envtf_lit.tasks import get_task
 from envtf_lit.world_models.ensemble import EnsembleDynamics
+from envtf_lit.world_models.store import save_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 ENSEMBLE = EnsembleOptions(
@@ -57,3 +59,20 @@ def test_unknown_models_and_bad_budgets_are_refused_before_any_work(tmp_path: Pa
         with pytest.raises(UserError, match=rf"{option} is {value}, expected an integer"):
             build_suite("hopper-medium", tmp_path, replace(TINY, **{option: value}), progress=False)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_further_models_are_checked_by_name_and_robot(tmp_path: Path) -> None:
+    hopper, walker = get_task("hopper-medium"), get_task("walker2d-medium")
+    for task in (hopper, walker):
+        robot = task.robot
+        model = EnsembleDynamics(robot.observation_dim, robot.action_dim, members=1, elites=1, hidden=(4,))
+        save_world_model(tmp_path / task.name / robot.name, model)
+    found = other_folders({"mine": f"{tmp_path}/{{task}}/{{robot}}"}, [hopper, walker])
+    assert found["walker2d-medium"] == {"mine": tmp_path / "walker2d-medium/walker2d"}
+    with pytest.raises(UserError, match=r"hopper-medium/hopper holds a world model of another robot: .* walker2d\."):
+        other_folders({"mine": f"{tmp_path}/hopper-medium/hopper"}, [hopper, walker])
+    with pytest.raises(UserError, match="nowhere is not a model folder"):
+        other_folders({"mine": f"{tmp_path}/nowhere"}, [hopper])
+    for name in ("context_1", "physics", "a.b"):
+        with pytest.raises(UserError, match=f"cannot be called {name!r}"):
+            other_folders({name: str(tmp_path)}, [hopper])

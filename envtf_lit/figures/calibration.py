@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from envtf_lit.figures.style import COLOURS, drawing, write_table
+from envtf_lit.figures.style import Look, drawing, model_looks, write_table
 
 Columns = Mapping[str, list[float]]
 TITLES = {
@@ -28,13 +28,14 @@ def calibration_page(curves: Mapping[str, Mapping[str, Mapping[str, Columns]]], 
     """Coverage, three ROC curves, and true error against predicted uncertainty (median, quartiles).
 
     Args:
-        curves: by robot, model and panel, as `envtf_lit.calibration` measures them.
+        curves: by robot, model and panel, as `envtf_lit.calibration` measures them; a model may lack some panels.
         path: PNG to write; the numbers go beside it as CSV.
     """
+    looks = model_looks(dict.fromkeys(model for models in curves.values() for model in models))
     with drawing(path, (3.1 * len(TITLES), 2.9 * len(curves) + 0.5), len(curves), len(TITLES)) as (figure, axes):
         for row, (robot, models) in zip(axes, curves.items(), strict=True):
             for axis, kind in zip(row, TITLES, strict=True):
-                _panel(axis, kind, {model: panels[kind] for model, panels in models.items()})
+                _panel(axis, kind, {model: panels[kind] for model, panels in models.items() if kind in panels}, looks)
             row[0].set_ylabel(f"{robot}\n{row[0].get_ylabel()}")
         for axis, title in zip(axes[0], TITLES.values(), strict=True):
             axis.set_title(title, fontsize="medium")
@@ -44,13 +45,13 @@ def calibration_page(curves: Mapping[str, Mapping[str, Mapping[str, Columns]]], 
     return Path(path)
 
 
-def _panel(axis: Axes, kind: str, models: Mapping[str, Columns]) -> None:
+def _panel(axis: Axes, kind: str, models: Mapping[str, Columns], looks: Mapping[str, Look]) -> None:
     x, y, xlabel, ylabel = AXES.get(kind, ROC)
     for model, columns in models.items():
-        colour = COLOURS[model]
-        axis.plot(columns[x], columns[y], color=colour, label=model, linewidth=1.8)
+        look = looks[model]
+        axis.plot(columns[x], columns[y], color=look.colour, linestyle=look.line, label=look.label, linewidth=1.8)
         if kind == "errors":
-            axis.fill_between(columns[x], columns["lower"], columns["upper"], color=colour, alpha=0.2, lw=0)
+            axis.fill_between(columns[x], columns["lower"], columns["upper"], color=look.colour, alpha=0.2, lw=0)
     axis.set(xlabel=xlabel, ylabel=ylabel)
     if kind == "errors":
         axis.set(xscale="log", yscale="log")

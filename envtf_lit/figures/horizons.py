@@ -1,15 +1,13 @@
 """Plots of several world models' errors over long horizons, a panel per robot."""
 
-from itertools import cycle
 from pathlib import Path
 
 import pandas as pd
 from matplotlib.axes import Axes
 
-from envtf_lit.figures.style import COLOURS, LABELS, drawing, write_table
+from envtf_lit.figures.style import COLOURS, Look, drawing, model_looks, write_table
 from envtf_lit.world_models.horizon import THRESHOLDS
 
-SPARE = ("#CC79A7", "#E69F00", "#F0E442", "#009E73")  # of models that have no colour of their own
 LOWEST, HIGHEST = 1e-6, 1e2  # errors that are drawn
 CEILING = "ceiling_typical"  # what median curves are to be compared with
 
@@ -26,10 +24,10 @@ def error_growth(curves: pd.DataFrame, run: str, path: str | Path) -> Path:
     shown = curves.query("run == @run")
     if run == "open_loop":
         shown = pd.concat([shown, curves.query("run == @CEILING and model == model.iloc[0]")])
-    robots, colours = shown["robot"].unique(), _colours(shown)
+    robots, looks = shown["robot"].unique(), model_looks(shown["model"].unique())
     with drawing(path, _size(len(robots), 3.7), 1, len(robots)) as (figure, axes):
         for axis, robot in zip(axes.flat, robots, strict=True):
-            _panel(axis, shown.query("robot == @robot"), colours)
+            _panel(axis, shown.query("robot == @robot"), looks)
             axis.set(title=robot, xlabel="step h")
         axes[0, 0].set_ylabel("normalised squared error")
         _legend(axes[0, -1])
@@ -42,11 +40,11 @@ def error_growth(curves: pd.DataFrame, run: str, path: str | Path) -> Path:
 def online_growth(curves: pd.DataFrame, path: str | Path) -> Path:
     """The open-loop errors along the actions of policies that drive MuJoCo: a row per policy, a column per robot."""
     shown = curves.query("run == 'open_loop'")
-    robots, policies, colours = shown["robot"].unique(), shown["source"].unique(), _colours(shown)
+    robots, policies, looks = shown["robot"].unique(), shown["source"].unique(), model_looks(shown["model"].unique())
     with drawing(path, _size(len(robots), 2.6 * len(policies)), len(policies), len(robots)) as (figure, axes):
         for row, policy in zip(axes, policies, strict=True):
             for axis, robot in zip(row, robots, strict=True):
-                _panel(axis, shown.query("robot == @robot and source == @policy"), colours)
+                _panel(axis, shown.query("robot == @robot and source == @policy"), looks)
                 axis.set_title(f"{robot}, {policy} policy", fontsize="medium")
             row[0].set_ylabel("normalised squared error")
         for axis in axes[-1]:
@@ -64,20 +62,22 @@ def steps_against_ceiling(lengths: pd.DataFrame, path: str | Path) -> Path:
         lengths: rows of `robot`, `model` (`physics` for the ceiling), `threshold`, `error`, `steps`, `standard_error`.
         path: PNG to write; the numbers go beside it as CSV.
     """
-    robots, colours = lengths["robot"].unique(), _colours(lengths)
+    robots, looks = lengths["robot"].unique(), model_looks(lengths["model"].unique())
     with drawing(path, _size(len(robots), 2.7 * len(THRESHOLDS)), len(THRESHOLDS), len(robots)) as (figure, axes):
         for row, threshold in zip(axes, THRESHOLDS, strict=True):
             for axis, robot in zip(row, robots, strict=True):
                 here = lengths.query("robot == @robot and threshold == @threshold")
                 for model, points in here.groupby("model", sort=False):
+                    look, physics = looks[str(model)], model == "physics"
                     axis.errorbar(
                         points["error"],
                         points["steps"],
                         points["standard_error"],
-                        color=colours[str(model)],
-                        label=_label(str(model)),
+                        color=look.colour,
+                        label=look.label,
                         capsize=3,
-                        **(dict(marker=".", linestyle="--") if model == "physics" else dict(marker="o", linestyle="")),
+                        marker="." if physics else look.marker,
+                        linestyle="--" if physics else "",
                     )
                 axis.set(xscale="log", title=f"{robot}, within {threshold:g}")
                 axis.set_ylim(bottom=0)
@@ -97,15 +97,15 @@ def _size(columns: int, height: float) -> tuple[float, float]:
     return 3.2 * columns + 2.0, height + 0.9
 
 
-def _panel(axis: Axes, curves: pd.DataFrame, colours: dict[str, str]) -> None:
+def _panel(axis: Axes, curves: pd.DataFrame, looks: dict[str, Look]) -> None:
     """Lines of every model, on logarithmic axes, with the thresholds."""
     for name, line in curves.query("run != @CEILING").groupby("model", sort=False):
-        model = str(name)
-        axis.fill_between(line["step"], line["lower"], line["upper"], color=colours[model], alpha=0.15, lw=0)
-        axis.plot(line["step"], line["median"], color=colours[model], label=_label(model))
+        look = looks[str(name)]
+        axis.fill_between(line["step"], line["lower"], line["upper"], color=look.colour, alpha=0.15, lw=0)
+        axis.plot(line["step"], line["median"], color=look.colour, linestyle=look.line, label=look.label)
     for name, line in curves.query("run == @CEILING").groupby("model", sort=False):
         line = line[line["median"] <= max(THRESHOLDS)]  # replays end there
-        label = f"physics, off as\n{_label(str(name))}"
+        label = f"physics, off as\n{looks[str(name)].label}"
         axis.plot(line["step"], line["median"], color=COLOURS["physics"], linestyle=":", zorder=3, label=label)
     for threshold in THRESHOLDS:
         axis.axhline(threshold, color=COLOURS["threshold"], linestyle="--", linewidth=1.0, zorder=1)
@@ -117,12 +117,3 @@ def _panel(axis: Axes, curves: pd.DataFrame, colours: dict[str, str]) -> None:
 
 def _legend(axis: Axes) -> None:
     axis.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
-
-
-def _label(model: str) -> str:
-    return LABELS.get(model, model)
-
-
-def _colours(table: pd.DataFrame) -> dict[str, str]:
-    spare = cycle(SPARE)
-    return {model: COLOURS[model] if model in COLOURS else next(spare) for model in table["model"].unique()}

@@ -1,7 +1,9 @@
 """One look for every plot: colours by meaning, labels with units, and PNG files with the same bytes every time."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,9 @@ LABELS = {
     "context_1": "transformer, context 1",
     "ensemble": "ensemble",
 }
+# of models that have no colour of their own: each colour with the first line style and marker, then with the next
+SPARE = ("#CC79A7", "#E69F00", "#F0E442", "#009E73")
+LINES = (("-", "o"), ("--", "s"), ("-.", "^"), ((0, (1, 1)), "D"))
 JOINTS = {
     "hopper": ("thigh", "leg", "foot"),
     "walker2d": ("right thigh", "right leg", "right foot", "left thigh", "left leg", "left foot"),
@@ -68,6 +73,33 @@ def observation_labels(robot: str | None, observation_dim: int) -> list[str]:
 def featured(observation_dim: int) -> list[int]:
     """Up to four dimensions worth showing: the first two, the middle one (our robots' x velocity) and the last."""
     return sorted({0, min(1, observation_dim - 1), observation_dim // 2, observation_dim - 1})
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a model is drawn in every panel of a figure.
+
+    Attributes:
+        colour: of its line, band and marker.
+        line: style of its line, as matplotlib has it.
+        marker: of its points.
+        label: in the legend.
+    """
+
+    colour: str
+    line: Any
+    marker: str
+    label: str
+
+
+def model_looks(models: Iterable[str]) -> dict[str, Look]:
+    """A look for each model; those that are not ours are told apart up to the sixteenth."""
+    spare = cycle((colour, line, marker) for line, marker in LINES for colour in SPARE)
+    looks = {}
+    for name in models:
+        colour, line, marker = (COLOURS[name], *LINES[0]) if name in COLOURS else next(spare)
+        looks[name] = Look(colour, line, marker, LABELS.get(name, name))
+    return looks
 
 
 @contextmanager
