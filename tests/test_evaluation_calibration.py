@@ -12,10 +12,12 @@ from test_transformer import batch_of, make_model, sequences
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.calibration import (
+    ProperScores,
     auroc,
     coverage,
     draw_points,
     novelties,
+    proper_scores,
     rank_correlation,
     roc_curve,
     rollout_errors,
@@ -61,6 +63,47 @@ def test_constant_dimensions_are_left_out(data):
     assert [value is None for value in result.by_dimension] == [False, False, True, False]
     live = [value for value in result.by_dimension if value is not None]
     assert result.mean == pytest.approx(sum(live) / 3)
+
+
+def scores(data, **options) -> ProperScores:
+    trajectories = whole_episodes(data, 6, seed=0)
+    taught = forecast(linear_world(**options), trajectories, feedback="recorded")
+    return proper_scores(taught, trajectories, Scale.of(data))
+
+
+def test_honest_spreads_have_the_scores_of_gaussians(data):
+    unit = NOISE / Scale.of(data).std[[0, 1, 3]].numpy()  # the third dimension is constant
+    found = scores(data, std=NOISE)
+    assert found.nll == pytest.approx(np.log(unit).mean() + 0.5 * np.log(2 * np.pi * np.e), abs=0.03)
+    assert found.crps == pytest.approx(unit.mean() / np.sqrt(np.pi), rel=0.03)
+    for std in (NOISE / 2, NOISE * 2):
+        assert scores(data, std=std).nll > found.nll + 0.1
+        assert scores(data, std=std).crps > found.crps * 1.05
+
+
+def test_the_ranked_score_is_the_integral_that_it_stands_for():
+    data = linear_data((1, 1, 1, 1))
+    trajectories, scale = whole_episodes(data, 4, seed=0), Scale.of(data)
+    taught = forecast(linear_world(error=0.5, std=0.2), trajectories, feedback="recorded")
+    grid, expected = np.linspace(-40.0, 40.0, 400_001), []
+    for column in np.flatnonzero(scale.live.numpy()):
+        mean, std = (
+            value[:, 0, column].double().numpy() / float(scale.std[column]) for value in (taught.mean, taught.std)
+        )
+        recorded = trajectories.targets[:, 0, column].double().numpy() / float(scale.std[column])
+        for m, s, y in zip(mean, std, recorded, strict=True):
+            below = 0.5 * torch.erfc(torch.from_numpy((m - grid) / s / np.sqrt(2.0))).numpy()
+            expected.append(np.trapezoid(np.square(below - (grid >= y)), grid))
+    assert proper_scores(taught, trajectories, scale).crps == pytest.approx(np.mean(expected), rel=1e-3)
+
+
+def test_certain_and_infinite_forecasts_have_finite_scores(data):
+    assert scores(data, std=0.0).nll == 1e8
+    world = linear_world(std=0.1)
+    world.matrix[0, 0] = float("nan")
+    trajectories = whole_episodes(data, 6, seed=0)
+    found = proper_scores(forecast(world, trajectories, feedback="recorded"), trajectories, Scale.of(data))
+    assert found == ProperScores(1e8, 1e8)
 
 
 def test_exact_predictions_without_spread_have_no_residual():

@@ -1,10 +1,11 @@
 """Does a world model know what it does not know?
 
-Aleatoric and epistemic spread together are judged by predictive intervals on held-out episodes; epistemic variance
-alone by how well it tells strange state-action pairs from familiar ones; the uncertainty u, by which imagined rewards
-are penalised, by whether it is large where the model's own rollouts are wrong, as MuJoCo says.
+Aleatoric and epistemic spread together are judged by predictive intervals and proper scores on held-out episodes;
+epistemic variance alone by how well it tells strange state-action pairs from familiar ones; the uncertainty u, by which
+imagined rewards are penalised, by whether it is large where the model's own rollouts are wrong, as MuJoCo says.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +18,9 @@ from envtf_lit.errors import UserError
 from envtf_lit.evaluation.physics import Physics
 from envtf_lit.imagination import BranchPoints, imagine
 from envtf_lit.policy import Policy
-from envtf_lit.world_models.horizon import Forecast, Scale, Trajectories
+from envtf_lit.world_models.horizon import LARGEST, Forecast, Scale, Trajectories
 from envtf_lit.world_models.interface import WorldModel
+from envtf_lit.world_models.normaliser import CONSTANT
 from envtf_lit.world_models.recalibration import half_width, standardised_residuals
 
 FIRST_STEPS = 10  # of an episode: just after a reset robots are where they hardly ever are again
@@ -52,6 +54,37 @@ def coverage(taught: Forecast, trajectories: Trajectories, scale: Scale, level: 
     live = scale.live.tolist()
     by_dimension = tuple(value if alive else None for value, alive in zip(share.tolist(), live, strict=True))
     return Coverage(level, float(share[scale.live].mean()), by_dimension)
+
+
+@dataclass(frozen=True)
+class ProperScores:
+    """What an honest forecast makes least, per live dimension and outcome, in z-scored units; at most 1e8.
+
+    Attributes:
+        nll: mean negative log-density.
+        crps: continuous ranked probability score: the absolute error, less what an honest spread excuses.
+    """
+
+    nll: float
+    crps: float
+
+
+def proper_scores(taught: Forecast, trajectories: Trajectories, scale: Scale) -> ProperScores:
+    """Scores of Gaussian one-step predictions at the recorded outcomes, mean over live dimensions and the reward.
+
+    Args:
+        taught: the teacher-forced forecast of `horizon_report`; a spread below 1e-6 z-scored units counts as that.
+        trajectories: what was forecast.
+        scale: the units, and which dimensions are live.
+    """
+    columns = (trajectories.targets - taught.mean, taught.std)
+    error, std = ((column[trajectories.valid] / scale.std)[:, scale.live].double() for column in columns)
+    std = std.clamp(min=CONSTANT)
+    z = error.nan_to_num(nan=math.inf) / std
+    nll = 0.5 * z.square() + std.log() + 0.5 * math.log(2.0 * math.pi)
+    density = math.sqrt(2.0 / math.pi) * torch.exp(-0.5 * z.square())  # twice that of z
+    crps = std * (z * torch.erf(z / math.sqrt(2.0)) + density - 1.0 / math.sqrt(math.pi))  # Gneiting and Raftery 2007
+    return ProperScores(*(min(float(score.mean()), LARGEST) for score in (nll, crps)))
 
 
 @dataclass(frozen=True, eq=False)
