@@ -238,7 +238,8 @@ class Course:
         """The uncertainty u against the true error along the model's own rollouts."""
         starts, steps = self.starts.to(self.device), self.options.rollout_steps
         run = rollout_errors(model, self.expert, starts, self.physics, self.scale, steps=steps)
-        numbers = {"rank_correlation": rank_correlation(run.uncertainty, run.error), "given_up": run.given_up}
+        numbers = {"rank_correlation": rank_correlation(run.uncertainty, run.error)}
+        numbers |= {"given_up": run.given_up, "clipped": run.clipped}
         return numbers, {"errors": _quantiles(run.uncertainty, run.error)}
 
 
@@ -246,7 +247,7 @@ def _quantiles(uncertainty: np.ndarray, error: np.ndarray) -> dict[str, list[flo
     """Quartiles of the error, and the median u, of the steps in order of u, cut into parts of equal size."""
     parts = np.array_split(np.argsort(uncertainty, kind="stable"), PARTS)
     rows = [[np.median(uncertainty[part]), *np.quantile(error[part], (0.25, 0.5, 0.75))] for part in parts if len(part)]
-    return dict(zip(("uncertainty", "lower", "median", "upper"), np.transpose(rows).tolist(), strict=True))
+    return dict(zip(("uncertainty", "lower", "median", "upper"), np.reshape(rows, (-1, 4)).T.tolist(), strict=True))
 
 
 def _headline(results: Results) -> str:
@@ -280,7 +281,7 @@ def page(found: Mapping[str, Results], tier: str) -> str:
     words = (
         "Share of held-out outcomes in each interval; negative log-density and continuous ranked probability score of "
         "one outcome of one dimension (std); AUROC of each contrast; rank correlation. The intervals of `transformer` "
-        "and `context_1` are scaled to hold 90 % on the other half of the held-out episodes; those of `ensemble` are as "
+        "and `context_1` are scaled to hold 90 % on the other half of the held-out episodes; the ensemble's are as "
         "published."
     )
     return f"## Models of {tier} data\n\n{words}\n\n{markdown_table(HEAD, rows)}\n"

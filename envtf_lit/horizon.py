@@ -164,6 +164,8 @@ class _Course:
         self.seed, self.start = suite.options.seed, measured.start
         self.device = pick_device()
         self.key = flat_settings(task.tier, suite.options, measured=measured)
+        if measured.start > 0 and task.robot.clipped_from is not None:
+            self.key["clipped_starts"] = "left out"  # they once counted, and results of then are others
         wanted = {RECORDED: (task, measured.trajectories)}
         wanted |= {name: (Task(task.robot, name), measured.online) for name in ONLINE}
         folder = run_folder(home, "episodes", self.key | {"measured.start": 0}, [])  # the same from every start
@@ -207,8 +209,7 @@ class _Course:
         return self._kept(name, [folder], work)
 
     def _ceiling(self, name: str, size: float) -> Tracking:
-        episodes = self.trajectories[RECORDED]
-        return track_ceiling(name, ceiling(self.physics, episodes, self.scale, size, seed=self.seed), episodes.lengths)
+        return track_ceiling(name, ceiling(self.physics, self.trajectories[RECORDED], self.scale, size, seed=self.seed))
 
     def _kept(self, name: str, inputs: list[Path], work: Callable[[], dict[str, Tracking]]) -> dict[str, Tracking]:
         """Results of the work, now or when it was done on the same inputs."""

@@ -15,6 +15,7 @@ from envtf_lit.errors import UserError, did_you_mean
 if TYPE_CHECKING:
     import gymnasium
 
+VELOCITY_LIMIT = 10.0  # beyond which some robots' velocities are observed as that
 TIERS = ("random", "medium", "medium-replay", "medium-expert", "full-replay")
 
 
@@ -89,6 +90,7 @@ class Robot:
     action_limit: float = 1.0  # actions lie in [-limit, limit]
     max_episode_steps: int = 1000
     variant: str = ""
+    clipped_from: int | None = None  # first dimension (of the velocities) that is observed clipped; None: none is
 
     def make(self) -> "gymnasium.Env":
         """The simulator, without Gymnasium's checks of our use of it and its advice to leave -v4."""
@@ -110,6 +112,11 @@ class Robot:
         """Whether friction, mass and actuator strength are drawn anew in each episode, unobserved."""
         return self.variant == "-hidden"
 
+    def clipped(self, observations: Tensor) -> Tensor:
+        """(...) bool, whether observations (..., S) may hide larger velocities than they show."""
+        first = self.observation_dim if self.clipped_from is None else self.clipped_from
+        return (observations[..., first:].abs() >= VELOCITY_LIMIT).any(-1)
+
     def normalised_score(self, episode_return: float) -> float:
         """D4RL's score: 0 is a random policy, 100 its expert. `100 (G - G_random) / (G_expert - G_random)`."""
         return 100.0 * (episode_return - self.return_random) / (self.return_expert - self.return_random)
@@ -118,9 +125,9 @@ class Robot:
 ROBOTS = {
     robot.name: robot
     for robot in (
-        Robot("hopper", "Hopper-v5", 11, 3, -20.272305, 3234.3, hopper_terminated),
+        Robot("hopper", "Hopper-v5", 11, 3, -20.272305, 3234.3, hopper_terminated, clipped_from=5),
         Robot("halfcheetah", "HalfCheetah-v5", 17, 6, -280.178953, 12135.0, never_terminated),
-        Robot("walker2d", "Walker2d-v5", 17, 6, 1.629008, 4592.3, walker2d_terminated),
+        Robot("walker2d", "Walker2d-v5", 17, 6, 1.629008, 4592.3, walker2d_terminated, clipped_from=8),
         # without the contact forces: the dimensions that are not constant zero in D4RL's Ant
         Robot("ant", "Ant-v5", 27, 8, -325.6, 3879.7, ant_terminated, {"include_cfrc_ext_in_observation": False}),
     )

@@ -32,6 +32,7 @@ def test_models_are_measured_once_and_drawn(tmp_path: Path) -> None:
     names = ("coverage_50", "coverage_90", "rank_correlation", *(f"auroc_{name}" for name in CONTRASTS))
     for model in MODELS:
         assert all(-1.0 <= numbers[f"hopper.{model}.{name}"] <= 1.0 for name in names)
+        assert 0.0 <= numbers[f"hopper.{model}.clipped"] < 1.0
         assert numbers[f"hopper.{model}.crps"] > 0.0 and f"hopper.{model}.nll" in numbers
     assert numbers["hopper.coverage_90"] == numbers["hopper.transformer.coverage_90"]
     assert lines[0].startswith("hopper: 50 % intervals hold ")

@@ -14,7 +14,7 @@ from web import Server, serving
 
 from envtf_lit.data import d4rl
 from envtf_lit.data.cards import counted_episodes, dataset_card
-from envtf_lit.data.d4rl import FILES, VELOCITIES, load_d4rl, read_d4rl, remote_file
+from envtf_lit.data.d4rl import FILES, load_d4rl, read_d4rl, remote_file
 from envtf_lit.data.fetch import RemoteFile
 from envtf_lit.data.sources import make_dataset
 from envtf_lit.errors import UserError
@@ -218,7 +218,7 @@ def test_velocities_are_clipped_where_the_simulator_clips_them(tmp_path: Path, n
     columns["observations"][0, -velocities:] = 50
     columns["observations"][1:2, :-velocities] = 20
     dataset, mended = read_d4rl(write(tmp_path / "a.hdf5", columns), task)
-    assert mended["clipped_velocities"] == (velocities if name in VELOCITIES else 0)
+    assert mended["clipped_velocities"] == (velocities if task.robot.clipped_from is not None else 0)
     assert np.array_equal(dataset.observations[0, -velocities:], shown[-velocities:])
     assert (dataset.observations[1, :-velocities] == 20).all()  # positions stay
     env.close()

@@ -142,6 +142,7 @@ def test_rank_correlation_by_hand():
     ties = rank_correlation(np.array([0.0, 5.0, 5.0, 7.0]), np.array([2.0, 1.0, 3.0, 4.0]))
     assert ties == pytest.approx(3 / 22.5**0.5)
     assert rank_correlation(np.ones(3), np.array([1.0, 2.0, 3.0])) == 0.0
+    assert rank_correlation(np.ones(0), np.ones(0)) == 0.0
 
 
 def random_log(lengths: tuple[int, ...]) -> OfflineDataset:
@@ -207,11 +208,15 @@ def test_novelty_is_that_of_the_last_token_after_the_true_past():
 
 @dataclass
 class TrueWorld:
-    """What really happens, in place of MuJoCo: a linear world; beyond a limit it gives up."""
+    """What really happens, in place of MuJoCo: a linear world; beyond a limit it gives up, or has clipped the state."""
 
     world: LinearWorld
     limit: float = float("inf")
-    robot = SimpleNamespace(terminated=never_terminated)
+    clip: float = float("inf")
+
+    @property
+    def robot(self) -> SimpleNamespace:
+        return SimpleNamespace(terminated=never_terminated, clipped=lambda states: states.abs().amax(-1) >= self.clip)
 
     def step(self, observations: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         state, action = torch.from_numpy(observations).float(), torch.from_numpy(actions)
@@ -249,5 +254,15 @@ def test_what_the_simulator_cannot_take_is_left_out_and_counted():
     physics = TrueWorld(linear_world(), limit=float(states.median()))
     run = rollout_errors(linear_world(), Still(), starts, physics, scale, steps=1)  # pyright: ignore
     assert len(run.error) == len(run.uncertainty) == 5
-    assert run.given_up == pytest.approx(0.5)
+    assert run.given_up == pytest.approx(0.5) and run.clipped == 0.0
     assert (run.error == 0.0).all()
+
+
+def test_states_whose_velocity_was_clipped_are_left_out_and_counted():
+    data = linear_data((40, 40))
+    starts, scale = draw_points(data, 10, history=2, seed=0), Scale.of(data)
+    states = starts.observations[torch.arange(10), starts.lengths - 1].abs().amax(1).sort().values
+    physics = TrueWorld(linear_world(), limit=float(states[7]), clip=float(states[5]))
+    run = rollout_errors(linear_world(), Still(), starts, physics, scale, steps=1)  # pyright: ignore
+    assert len(run.error) == 5
+    assert (run.given_up, run.clipped) == (pytest.approx(0.2), pytest.approx(0.3))

@@ -106,6 +106,28 @@ def test_clipped_velocities_are_lost() -> None:
     assert np.abs(following - rows.following[~rows.whole]).max() > 0.01
 
 
+def test_a_robot_knows_which_observations_are_clipped() -> None:
+    for name in ROBOTS:
+        rows = recorded(name)
+        clipped = ROBOTS[name].clipped(torch.from_numpy(rows.observations)).numpy()
+        np.testing.assert_array_equal(clipped, ~rows.whole)
+    assert bool(get_task("hopper-medium-v4").robot.clipped(torch.full((11,), -10.0)))
+    assert not bool(ROBOTS["ant"].clipped(torch.full((27,), 50.0)))
+
+
+def test_ceilings_leave_out_trajectories_that_start_at_a_clipped_state() -> None:
+    dataset = as_dataset(recorded("walker2d"))
+    whole, scale, robot = whole_episodes(dataset, 3, seed=0), Scale.of(dataset), ROBOTS["walker2d"]
+    starts = [whole.later(t) for t in range(20)]
+    partly = next(late for late in starts if 0 < int(robot.clipped(late.observations[:, 0]).sum()) < len(late.lengths))
+    clear = ~robot.clipped(partly.observations[:, 0])
+    found = ceiling(Physics(robot), partly, scale, 0.0, seed=0)
+    assert torch.equal(found.lengths, partly.lengths[clear]) and len(found.error) == int(clear.sum())
+    assert found.steps[0.1].censored == 1.0  # an undisturbed replay is the record
+    with pytest.raises(UserError, match="Every trajectory of walker2d begins with a velocity that its observation"):
+        ceiling(Physics(robot), partly.select(~clear), scale, 0.0, seed=0)
+
+
 def test_rows_do_not_influence_each_other() -> None:
     rows, physics = recorded("ant"), Physics(ROBOTS["ant"])
     together = physics.step(rows.observations[:20], rows.actions[:20])

@@ -85,7 +85,7 @@ def test_drawn_rollouts_leave_the_record_sooner_and_have_a_seed() -> None:
 def test_a_ceiling_has_numbers_and_a_curve_of_its_name() -> None:
     error = torch.tensor([[0.0, 0.05, torch.inf]] * 5)
     lengths = torch.full((5,), 3)
-    found = track_ceiling("most", Ceiling(0.1, {0.01: Steps.within(error, lengths, 0.01)}, error), lengths)
+    found = track_ceiling("most", Ceiling(0.1, {0.01: Steps.within(error, lengths, 0.01)}, error, lengths))
     assert found.numbers["most_0.01"] == 1.0 and found.numbers["most_0.01_censored"] == 0.0
     assert found.curves["most"]["median"] == pytest.approx([1e-8, 0.05, 1e8])
 

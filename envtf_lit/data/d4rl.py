@@ -18,7 +18,7 @@ from envtf_lit.data.fetch import RemoteFile, fetch, fingerprint
 from envtf_lit.data.formats import open_raw
 from envtf_lit.data.validation import build_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.tasks import Robot, Task
+from envtf_lit.tasks import VELOCITY_LIMIT, Robot, Task
 
 # the second is a copy by others; the sums make it as good as the first
 SERVERS = (
@@ -48,8 +48,6 @@ FILES = {  # bytes and sha256
     "ant-full-replay": (449390167, "b95b0a7f34b1d5d1bedfded0f8e9cfc508b59de83cd4cbfb65b18dbd5056f26c"),
 }
 ANT_DIMENSIONS = 111  # of which those from 27 on are contact forces that its simulator never filled: all zero
-VELOCITIES = {"hopper": 5, "walker2d": 8}  # first velocity in the observation of the robots whose simulator clips them
-VELOCITY_LIMIT = 10.0
 ROUNDING = 1e-4  # relative and absolute: what is farther apart is not the same observation
 
 
@@ -189,9 +187,9 @@ def _flat(name: str, values: np.ndarray) -> np.ndarray:
 def _clip_velocities(columns: dict[str, np.ndarray], robot: Robot) -> int:
     """-v2 and -v4 show no velocity beyond the limit; neither may a log that a policy is trained on for them."""
     clipped = 0
-    for name in ("observations", "next_observations") if robot.name in VELOCITIES else ():
+    for name in ("observations", "next_observations") if robot.clipped_from is not None else ():
         if name in columns and columns[name].ndim == 2:
-            velocities = columns[name][:, VELOCITIES[robot.name] :]
+            velocities = columns[name][:, robot.clipped_from :]
             clipped += int((np.abs(velocities) > VELOCITY_LIMIT).sum())
             np.clip(velocities, -VELOCITY_LIMIT, VELOCITY_LIMIT, out=velocities)
     return clipped

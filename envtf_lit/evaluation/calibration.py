@@ -163,7 +163,7 @@ def auroc(familiar: np.ndarray, strange: np.ndarray) -> float:
 def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
     """Spearman's: Pearson's correlation of the ranks, ties sharing their mean rank; 0 where either is constant."""
     ranks = np.stack([_ranks(first), _ranks(second)])
-    if (ranks.std(1) == 0).any():
+    if ranks.size == 0 or (ranks.std(1) == 0).any():
         return 0.0
     return float(np.corrcoef(ranks)[0, 1])
 
@@ -191,12 +191,15 @@ class RolloutErrors:
         uncertainty: (M,) the model's u of the step.
         error: (M,) root mean square over live observation dimensions of (imagined - true next observation), in
             standard deviations of the training data.
-        given_up: share of the steps whose imagined state the simulator could not take; they are left out.
+        given_up: share of the steps whose state the simulator could not take; they are left out.
+        clipped: share of the steps, those aside, that begin where the observation clips a velocity, so that a restart
+            there tells nothing of the truth; they are left out, too.
     """
 
     uncertainty: np.ndarray
     error: np.ndarray
     given_up: float
+    clipped: float
 
 
 def rollout_errors(
@@ -218,5 +221,7 @@ def rollout_errors(
     live, std = scale.live[:-1].cpu().numpy(), scale.std[:-1].double().cpu().numpy()
     error = np.sqrt(np.square((imagined - true)[:, live] / std[live]).mean(1))
     uncertainty = run.uncertainty.double().cpu().numpy()
-    kept = np.isfinite(error) & np.isfinite(uncertainty)
-    return RolloutErrors(uncertainty[kept], error[kept], given_up=float(1.0 - kept.mean()))
+    finite = np.isfinite(error) & np.isfinite(uncertainty)
+    clipped = finite & physics.robot.clipped(run.observations).cpu().numpy()
+    kept = finite & ~clipped
+    return RolloutErrors(uncertainty[kept], error[kept], float(1.0 - finite.mean()), float(clipped.mean()))

@@ -4,7 +4,7 @@ An observation holds a robot's whole state, but for three things:
 
 - Its position along the ground, on which the motion does not depend; it restarts at 0.
 - Velocities beyond ±10 of Hopper and Walker2d, which Gymnasium clips in the observation: from there on a restarted
-  robot moves differently.
+  robot moves differently. Such starts are left out wherever a restart is to say what is true.
 - The part of Ant's reward that stems from where MuJoCo last evaluated the torso, within the step before: rewards of
   restarted Ants differ from recorded ones, in trajectories of ours by up to 0.07.
 
@@ -144,11 +144,13 @@ class Ceiling:
         size: of the disturbance, in standard deviations of each live dimension.
         steps: by threshold.
         error: (B, T) nmse of the replays, infinite where one has passed the largest threshold.
+        lengths: (B,) valid steps.
     """
 
     size: float
     steps: dict[float, Steps]
     error: Tensor
+    lengths: Tensor
 
 
 def ceiling(
@@ -164,13 +166,23 @@ def ceiling(
 
     Args:
         physics: of the robot that was recorded.
-        trajectories: whole episodes.
+        trajectories: recorded; those whose first state has a clipped velocity are left out, for no replay of theirs
+            would begin as the record did.
         scale: the units of the disturbance and of the nmse.
         size: such as a model's own one-step error, the root of its mean one-step nmse.
         seed: of the disturbance's direction.
         thresholds: of the nmse.
+
+    Raises:
+        UserError: every trajectory begins with a clipped velocity.
     """
+    trajectories = trajectories.select(~physics.robot.clipped(trajectories.observations[:, 0]))
+    if len(trajectories.lengths) == 0:
+        raise UserError(
+            f"Every trajectory of {physics.robot.name} begins with a velocity that its observation clips: take more of "
+            "them, or let them start earlier."
+        )
     starts = perturbed(trajectories, scale, size, seed=seed)
     outcomes = physics.replay(trajectories, starts, scale, beyond=max(thresholds)).to(trajectories.targets.device)
-    error = nmse(outcomes, trajectories, scale)
-    return Ceiling(size, {t: Steps.within(error, trajectories.lengths, t) for t in thresholds}, error)
+    error, lengths = nmse(outcomes, trajectories, scale), trajectories.lengths
+    return Ceiling(size, {t: Steps.within(error, lengths, t) for t in thresholds}, error, lengths)

@@ -97,9 +97,9 @@ def track_sampled(model: WorldModel, trajectories: Trajectories, scale: Scale, *
     return Tracking(_numbers("sampled_open_loop", found))
 
 
-def track_ceiling(name: str, found: Ceiling, lengths: Tensor) -> Tracking:
+def track_ceiling(name: str, found: Ceiling) -> Tracking:
     """A physics ceiling as numbers and a curve of that name."""
-    return Tracking(_numbers(name, found.steps), {name: _curve(found.error, lengths)})
+    return Tracking(_numbers(name, found.steps), {name: _curve(found.error, found.lengths)})
 
 
 def _numbers(name: str, by_threshold: Mapping[float, Steps]) -> dict[str, float]:

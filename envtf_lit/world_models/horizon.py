@@ -72,9 +72,13 @@ class Trajectories:
 
     def later(self, start: int) -> "Trajectories":
         """Those that last longer than `start` steps, without their first `start`."""
-        rows = self.lengths > start
         columns = (self.observations, self.actions, self.targets)
-        return Trajectories(*(column[rows, start:] for column in columns), lengths=self.lengths[rows] - start)
+        shorter = Trajectories(*(column[:, start:] for column in columns), lengths=self.lengths - start)
+        return shorter.select(self.lengths > start)
+
+    def select(self, rows: Tensor) -> "Trajectories":
+        """Those of some rows: indices, or (B,) bool."""
+        return Trajectories(*(column[rows] for column in (self.observations, self.actions, self.targets, self.lengths)))
 
     def to(self, device: torch.device | str) -> "Trajectories":
         """The same on another device."""
