@@ -29,7 +29,17 @@ from envtf_lit.evaluation.physics import Physics
 from envtf_lit.evaluation.returns import SEED_OFFSET
 from envtf_lit.figures.calibration import calibration_page
 from envtf_lit.storage import pick_device, write_json, write_text
-from envtf_lit.suite import MODELS, WORK, Suite, SuiteOptions, build_suite, flat_settings, kept, other_folders
+from envtf_lit.suite import (
+    MODELS,
+    WORK,
+    Suite,
+    SuiteOptions,
+    build_suite,
+    flat_settings,
+    heading,
+    kept,
+    other_folders,
+)
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.world_models.horizon import Scale, forecast, whole_episodes
 from envtf_lit.world_models.interface import WorldModel
@@ -113,12 +123,12 @@ def compare(
     further = other_folders(others or {}, tasks)
     torch.set_num_threads(options.threads)
     found: dict[str, Results] = {}
-    numbers = flat_settings(tier, options, calibration=measured)
+    numbers = heading(tier, options, calibration=measured)
     for task in tasks:
         name = task.robot.name
         built = build_suite(task.name, work, options, progress=progress)
         found[name] = measure(task, built, work / task.name, measured, others=further[task.name], progress=progress)
-        numbers |= flat_numbers({name: found[name]})
+        numbers |= built.costs | flat_numbers({name: found[name]})
         write_json(out, numbers)
         write_text(out.with_suffix(".md"), page(found, tier))
         curves = {robot: {model: one.curves for model, one in results.items()} for robot, results in found.items()}

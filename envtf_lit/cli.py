@@ -410,9 +410,9 @@ def _comparison(namespace: argparse.Namespace) -> dict[str, Any]:
 
 
 def _hidden(namespace: argparse.Namespace, rest: list[str]) -> None:
-    from envtf_lit.hidden import compare
+    from envtf_lit.hidden import HiddenOptions, compare
 
-    compare(**_comparison(namespace), unseen=namespace.unseen)
+    compare(**_comparison(namespace), measured=HiddenOptions(namespace.unseen))
 
 
 def _horizon(namespace: argparse.Namespace, rest: list[str]) -> None:

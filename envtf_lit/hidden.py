@@ -1,22 +1,37 @@
 """`envtf hidden`: what memory is worth where a robot's friction, mass and strength are hidden."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from envtf_lit.data.behaviour import collect, plan
-from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import load_dataset, save_dataset
 from envtf_lit.evaluation.recognition import Recognition, recognition, recognition_metrics, stretches
 from envtf_lit.figures.recognition import recognition_curves
-from envtf_lit.storage import write_json
-from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite
+from envtf_lit.storage import pick_device, write_json
+from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite, flat_settings, heading, kept
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.world_models.horizon import Scale
 from envtf_lit.world_models.store import load_world_model
 
 UNSEEN_SEED = 1_000_000  # added to the suite's seed: no draw of its data comes again
-STRETCHES = 2_000
+
+
+@dataclass(frozen=True)
+class HiddenOptions:
+    """What models are measured on.
+
+    Attributes:
+        unseen: transitions collected for it.
+        stretches: of those, drawn at random.
+    """
+
+    unseen: int = 100_000
+    stretches: int = 2_000
 
 
 def compare(
@@ -26,7 +41,7 @@ def compare(
     tier: str = "medium-replay",
     work: Path = WORK,
     options: SuiteOptions,
-    unseen: int = 100_000,
+    measured: HiddenOptions = HiddenOptions(),
     progress: bool = True,
     report: Callable[[str], None] = print,
 ) -> dict[str, Any]:
@@ -38,7 +53,7 @@ def compare(
         tier: of the data that models are trained and measured on.
         work: folder of suites; what was trained there before with the same options is used again.
         options: of the data and the models.
-        unseen: transitions to collect for the measurement.
+        measured: on how much.
         progress: shows bars.
         report: called with a line for each robot and model.
 
@@ -48,17 +63,16 @@ def compare(
     Raises:
         UserError: an unknown robot or tier, an option out of range, or a folder that cannot be written.
     """
-    tasks = {robot: get_task(f"{robot}-{tier}-hidden") for robot in robots}
-    for task in tasks.values():
-        plan(task, unseen)  # complains before anything is trained
-    metrics: dict[str, Any] = {"tier": tier, "transitions": options.transitions, "updates": options.updates}
-    metrics |= {"context": options.context, "unseen_transitions": unseen, "stretches": STRETCHES, "seed": options.seed}
+    tasks = [get_task(f"{robot}-{tier}-hidden") for robot in dict.fromkeys(robots)]
+    for task in tasks:
+        plan(task, measured.unseen)  # complains before anything is trained
+    torch.set_num_threads(options.threads)
+    metrics = heading(tier, options, measured=measured)
     found = dict[str, dict[str, Recognition]]()
-    for robot, task in tasks.items():
-        suite = build_suite(task.name, work, options, progress=progress)
-        found[robot] = _measure(suite, _unseen(task, suite, unseen, progress))
-        for name, seconds in suite.seconds.items():
-            metrics[f"{robot}.{name}.train_seconds"] = seconds
+    for task in tasks:
+        robot, suite = task.robot.name, build_suite(task.name, work, options, progress=progress)
+        found[robot] = _measure(task, suite, work / task.name, measured, progress)
+        metrics |= suite.costs
         for name, value in recognition_metrics(found[robot]).items():
             metrics[f"{robot}.{name}"] = value
             if isinstance(value, float):
@@ -68,16 +82,28 @@ def compare(
     return metrics
 
 
-def _unseen(task: Task, suite: Suite, transitions: int, progress: bool) -> OfflineDataset:
-    """Episodes of new draws; their file is named by what made them."""
+def _unseen(task: Task, suite: Suite, transitions: int, progress: bool) -> Path:
+    """A file of episodes of new draws, named by what made them."""
     seed = suite.options.seed + UNSEEN_SEED
     path = suite.dataset.with_name(f"unseen-{transitions}-{seed}.h5")
     if not path.exists():
         save_dataset(collect(task, transitions, seed=seed, workers=suite.options.threads, progress=progress), path)
-    return load_dataset(path)
+    return path
 
 
-def _measure(suite: Suite, unseen: OfflineDataset) -> dict[str, Recognition]:
-    scale = Scale.of(suite.split()[0])
-    trajectories = stretches(unseen, STRETCHES, seed=suite.options.seed)
-    return {name: recognition(load_world_model(folder), trajectories, scale) for name, folder in suite.folders.items()}
+def _measure(task: Task, suite: Suite, home: Path, measured: HiddenOptions, progress: bool) -> dict[str, Recognition]:
+    """Every model's errors, now or when they were measured on the same draws."""
+    unseen, device = _unseen(task, suite, measured.unseen, progress), pick_device()
+    settings = flat_settings(task.tier, suite.options, measured=measured)
+    scale = Scale.of(suite.split()[0], device)
+    trajectories = stretches(load_dataset(unseen), measured.stretches, seed=suite.options.seed).to(device)
+
+    def one(folder: Path) -> dict[str, Any]:
+        return asdict(recognition(load_world_model(folder).to(device), trajectories, scale))
+
+    return {
+        name: Recognition(
+            **kept(home, f"hidden-{name}", settings, [suite.dataset, unseen, folder], partial(one, folder))
+        )
+        for name, folder in suite.folders.items()
+    }

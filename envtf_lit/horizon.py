@@ -26,6 +26,7 @@ from envtf_lit.suite import (
     SuiteOptions,
     build_suite,
     flat_settings,
+    heading,
     kept,
     other_folders,
 )
@@ -98,7 +99,7 @@ def compare(
     torch.set_num_threads(options.threads)
     clock = _Clock([SUITE, EPISODES, PHYSICS, *models, *(others or {})], len(tasks), report)
     found: dict[str, Results] = {}
-    numbers = flat_settings(tier, options, measured=measured)
+    numbers = heading(tier, options, measured=measured)
     for task in tasks:
         robot = task.robot.name
         built = build_suite(task.name, work, options, models=models, progress=progress)
@@ -110,8 +111,7 @@ def compare(
         for name, folder in (built.folders | further[task.name]).items():
             found[robot][name] = course.measure(name, folder)
             clock.done(name, f"{robot}: {name}: {_headline(found[robot][name][RECORDED].numbers)}")
-        numbers |= {f"{robot}.{name}.train_seconds": value for name, value in built.seconds.items()}
-        numbers |= flat_numbers({robot: found[robot]})
+        numbers |= built.costs | flat_numbers({robot: found[robot]})
         write_json(out, numbers)
         write_text(out.with_suffix(".md"), page(found, tier))
         draw(found, out.with_suffix(""))

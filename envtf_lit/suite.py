@@ -20,8 +20,9 @@ from envtf_lit import pipeline
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import load_dataset
 from envtf_lit.errors import UserError, did_you_mean
+from envtf_lit.machine import hardware
 from envtf_lit.params import DownloadOptions, EnsembleOptions, ModelOptions, Params, Precision, TrainModelOptions
-from envtf_lit.storage import read_json, write_json
+from envtf_lit.storage import pick_device, read_json, write_json
 from envtf_lit.tasks import Robot, Task, get_task
 from envtf_lit.training import run_folder
 from envtf_lit.validation import check_ranges, check_world_model
@@ -67,6 +68,7 @@ class Suite:
         dataset: the file that all models were trained on.
         folders: by the model's name.
         seconds: of training, by the model's name, as measured when it was trained.
+        updates: gradient steps that it was trained for, by the model's name; the ensemble stops early.
     """
 
     task: str
@@ -75,6 +77,13 @@ class Suite:
     dataset: Path
     folders: dict[str, Path]
     seconds: dict[str, float]
+    updates: dict[str, int]
+
+    @property
+    def costs(self) -> dict[str, float]:
+        """`robot.model.train_seconds` and `robot.model.updates` of every model."""
+        kinds = {"train_seconds": self.seconds, "updates": self.updates}
+        return {f"{self.robot.name}.{name}.{kind}": value for kind, by in kinds.items() for name, value in by.items()}
 
     def split(self) -> tuple[OfflineDataset, OfflineDataset]:
         """The episodes that every model was trained on, and those that none was trained or calibrated on."""
@@ -83,7 +92,7 @@ class Suite:
 
 
 def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
-    """What a comparison's numbers depend on, under flat keys: `tier`, `suite.…`, `versions.…`.
+    """What a comparison's numbers depend on beside the models, under flat keys: `tier`, `suite.…`, `versions.…`.
 
     Args:
         tier: of the data.
@@ -97,6 +106,16 @@ def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str
         **{f"{prefix}.{name}": value for prefix, what in measured.items() for name, value in asdict(what).items()},
         **{f"versions.{name}": version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")},
     }
+
+
+def heading(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
+    """What stands at the head of a comparison's file: `flat_settings`, `suite.ensemble.…` and `machine.…`.
+
+    `kept` asks for neither of the latter: the models' bytes tell how they were trained, and the machine hardly counts.
+    """
+    ensemble = {f"suite.ensemble.{name}": value for name, value in _plain(options.ensemble).items()}
+    machine = {f"machine.{name}": value for name, value in hardware(pick_device()).items()}
+    return flat_settings(tier, options, **measured) | ensemble | machine
 
 
 def kept(home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path], measure: Callable[[], Any]) -> Any:
@@ -162,7 +181,7 @@ def build_suite(
     origin = {"task": task, "transitions": options.transitions, "seed": options.seed}
     shared = replace(Params(), task=task, **_common(options))
     _unless_done(home / "data.json", origin, lambda: pipeline.download(shared, home, progress=progress))
-    suite = Suite(task, get_task(task).robot, options, home / pipeline.DATASET, {}, {})
+    suite = Suite(task, get_task(task).robot, options, home / pipeline.DATASET, {}, {}, {})
     for name in models:
         add_model(suite, name, params[name].train_model, progress=progress)
     return suite
@@ -188,9 +207,11 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
     suite.folders[name] = home / "models" / name
     train = partial(_train, params, suite.dataset, suite.folders[name], home, progress)
     suite.seconds[name] = _unless_done(home / "models" / f"{name}.json", key, train)
+    epochs = len((suite.folders[name] / "curves.csv").read_text().splitlines()) - 1  # the first line names columns
+    suite.updates[name] = epochs * (options.ensemble or options).updates_per_epoch
 
 
-def _plain(options: TrainModelOptions) -> dict[str, Any]:
+def _plain(options: TrainModelOptions | EnsembleOptions) -> dict[str, Any]:
     """As JSON has them, with lists for tuples."""
     return json.loads(json.dumps(asdict(options)))
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from envtf_lit.bench.cost import _plain, bench_cost
-from envtf_lit.bench.machine import in_turns, ratio, typical
 from envtf_lit.bench.speed import _training, bench_model
 from envtf_lit.cli import _suite_options, build_parser, main
+from envtf_lit.machine import in_turns, ratio, typical
 from envtf_lit.params import EnsembleOptions, ModelOptions, TrainModelOptions
 from envtf_lit.suite import SuiteOptions
 from envtf_lit.tasks import ROBOTS

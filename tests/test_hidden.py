@@ -12,6 +12,7 @@ from PIL import Image
 
 from envtf_lit import hidden
 from envtf_lit.errors import UserError
+from envtf_lit.hidden import HiddenOptions
 from envtf_lit.params import EnsembleOptions
 from envtf_lit.suite import MODELS, Suite, SuiteOptions, build_suite
 
@@ -22,19 +23,23 @@ TINY = SuiteOptions(transitions=1_000, updates=2, context=20, ensemble=ENSEMBLE,
 
 
 def test_models_are_measured_on_draws_that_none_has_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hidden, "STRETCHES", 20)
     lines = list[str]()
-    facts: dict[str, Any] = dict(tier="medium", work=tmp_path, options=TINY, unseen=1_000, progress=False)
+    facts: dict[str, Any] = dict(
+        tier="medium", work=tmp_path, options=TINY, measured=HiddenOptions(1_000, 20), progress=False
+    )
     metrics = hidden.compare(tmp_path / "out/hidden.json", robots=["hopper"], report=lines.append, **facts)
     assert json.loads((tmp_path / "out/hidden.json").read_text()) == metrics
     for name in MODELS:
         assert len(metrics[f"hopper.{name}.one_step_by_context"]) == 32
         assert metrics[f"hopper.{name}.one_step"] == metrics[f"hopper.{name}.one_step_by_context"][16]
-        assert metrics[f"hopper.{name}.train_seconds"] > 0
+        assert metrics[f"hopper.{name}.train_seconds"] > 0 and metrics[f"hopper.{name}.updates"] == 2
         assert any(line.startswith(f"hopper.{name}.open_loop: ") for line in lines)
     assert metrics["hopper.transformer.one_step_vs_ensemble"] == pytest.approx(
         metrics["hopper.transformer.one_step"] / metrics["hopper.ensemble.one_step"]
     )
+    assert metrics["suite.ensemble.members"] == 2 and metrics["suite.ensemble.hidden"] == [8]
+    assert metrics["measured.stretches"] == 20 and metrics["suite.precision"] == "bf16"
+    assert metrics["machine.cores"] > 0 and "machine.device" in metrics
     with Image.open(tmp_path / "out/hidden.png") as figure:
         assert figure.size[0] > 800
     assert len(pd.read_csv(tmp_path / "out/hidden.csv")) == 3 * (32 + 25)
@@ -45,6 +50,7 @@ def test_models_are_measured_on_draws_that_none_has_seen(tmp_path: Path, monkeyp
         starts = [np.asarray(file["observations"])[0] for file in (seen, new)]
     assert not np.array_equal(*starts)
     made = unseen.stat().st_mtime_ns
+    monkeypatch.setattr(hidden, "recognition", None)  # nothing is measured again
     again = hidden.compare(tmp_path / "again.json", robots=["hopper"], report=lines.append, **facts)
     assert again == metrics and unseen.stat().st_mtime_ns == made
 
@@ -63,5 +69,5 @@ def test_unknown_names_are_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="halfcheetah-meduim-hidden"):
         hidden.compare(tmp_path / "hidden.json", tier="meduim", work=tmp_path, options=TINY)
     with pytest.raises(UserError, match="1 transitions are too few"):
-        hidden.compare(tmp_path / "hidden.json", work=tmp_path, options=TINY, unseen=1)
+        hidden.compare(tmp_path / "hidden.json", work=tmp_path, options=TINY, measured=HiddenOptions(1))
     assert list(tmp_path.iterdir()) == []

@@ -41,7 +41,9 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(tmp_path: Path
     assert build_suite("hopper-medium", tmp_path, TINY, progress=False) == suite
     options = TrainModelOptions(ModelOptions(layers=1, heads=1, width=8, bounded=True), updates=2, updates_per_epoch=2)
     add_model(suite, "bounded", options, progress=False)
-    assert load_world_model(suite.folders.pop("bounded")).options.bounded and suite.seconds.pop("bounded") > 0
+    assert load_world_model(suite.folders["bounded"]).options.bounded
+    assert suite.costs["hopper.bounded.train_seconds"] > 0
+    assert suite.costs["hopper.bounded.updates"] == 2 and suite.costs["hopper.ensemble.updates"] == 4
     changed = replace(TINY, ensemble=replace(ENSEMBLE, hidden=(9,)))
     build_suite("hopper-medium", tmp_path, changed, progress=False)
     anew = {path for path, time in written.items() if path.stat().st_mtime_ns != time}

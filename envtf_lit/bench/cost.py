@@ -17,7 +17,7 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from envtf_lit.bench.machine import facts
+from envtf_lit.machine import facts
 from envtf_lit.params import TrainModelOptions
 from envtf_lit.storage import pick_device, write_json
 from envtf_lit.suite import WORK, SuiteOptions, build_suite, model_params

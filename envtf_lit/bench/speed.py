@@ -15,9 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from envtf_lit.bench.machine import bench_device, facts, in_turns, ratio, seconds, typical
 from envtf_lit.config import preset_params
 from envtf_lit.imagination import Starts, imagine
+from envtf_lit.machine import bench_device, facts, in_turns, ratio, seconds, typical
 from envtf_lit.params import GenerateRolloutsOptions, Precision, TrainModelOptions
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.storage import write_json

@@ -15,21 +15,22 @@ HISTORY, HORIZON = 16, 25  # the open loop's: steps seen before it, and its leng
 QUANTILES = (0.25, 0.5, 0.75)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Recognition:
-    """A model's normalised squared errors (nmse, see `world_models.horizon`) on N stretches of episodes.
+    """Lower quartile, median and upper quartile of a model's errors (nmse, see `world_models.horizon`) over stretches.
 
     Attributes:
-        one_step: (N, 32) one step ahead, column c after c steps of true history.
-        open_loop: (N, 25) column h - 1 after h steps of the model's own, begun after 16 steps of true history.
+        one_step: 3 curves of 32: one step ahead, the c-th after c steps of true history.
+        open_loop: 3 curves of 25: after 1 to 25 steps of the model's own, begun after 16 steps of true history.
     """
 
-    one_step: Tensor
-    open_loop: Tensor
+    one_step: list[list[float]]
+    open_loop: list[list[float]]
 
-    def quantiles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower quartile, median and upper quartile over the stretches: (3, 32) and (3, 25)."""
-        return tuple(np.quantile(error.cpu().numpy(), QUANTILES, axis=0) for error in (self.one_step, self.open_loop))  # pyright: ignore[reportReturnType]
+    @classmethod
+    def of(cls, one_step: Tensor, open_loop: Tensor) -> "Recognition":
+        """From the errors (N, 32) and (N, 25) of N stretches."""
+        return cls(*(np.quantile(error.cpu().numpy(), QUANTILES, axis=0).tolist() for error in (one_step, open_loop)))
 
 
 def stretches(dataset: OfflineDataset, count: int, *, seed: int) -> Trajectories:
@@ -49,7 +50,7 @@ def recognition(model: WorldModel, trajectories: Trajectories, scale: Scale) -> 
     taught = forecast(model, trajectories, feedback="recorded")
     free = forecast(model, trajectories, feedback="imagined", history=HISTORY)
     one_step, open_loop = (nmse(run.mean, trajectories, scale) for run in (taught, free))
-    return Recognition(one_step[:, :CONTEXT], open_loop[:, HISTORY : HISTORY + HORIZON])
+    return Recognition.of(one_step[:, :CONTEXT], open_loop[:, HISTORY : HISTORY + HORIZON])
 
 
 def recognition_metrics(found: dict[str, Recognition]) -> dict[str, Any]:
@@ -60,11 +61,11 @@ def recognition_metrics(found: dict[str, Recognition]) -> dict[str, Any]:
     """
     metrics: dict[str, Any] = {}
     for name, errors in found.items():
-        one_step, open_loop = (curves[1] for curves in errors.quantiles())
-        metrics[f"{name}.one_step"] = float(one_step[HISTORY])
-        metrics[f"{name}.open_loop"] = float(open_loop[-1])
-        metrics[f"{name}.one_step_by_context"] = one_step.tolist()
-        metrics[f"{name}.open_loop_by_step"] = open_loop.tolist()
+        one_step, open_loop = errors.one_step[1], errors.open_loop[1]
+        metrics[f"{name}.one_step"] = one_step[HISTORY]
+        metrics[f"{name}.open_loop"] = open_loop[-1]
+        metrics[f"{name}.one_step_by_context"] = one_step
+        metrics[f"{name}.open_loop_by_step"] = open_loop
     for name in found.keys() - {"transformer"}:
         for kind in ("one_step", "open_loop"):
             metrics[f"transformer.{kind}_vs_{name}"] = metrics[f"transformer.{kind}"] / metrics[f"{name}.{kind}"]

@@ -48,7 +48,7 @@ def recognition_curves(found: Mapping[str, Mapping[str, Recognition]], path: str
 def _curves(errors: Recognition) -> dict[str, pd.DataFrame]:
     """Quartiles of each kind of error, by steps of history and by steps of the model's own."""
     tables = {}
-    for kind, first, (lower, median, upper) in zip(PANELS, (0, 1), errors.quantiles(), strict=True):
+    for kind, first, (lower, median, upper) in zip(PANELS, (0, 1), (errors.one_step, errors.open_loop), strict=True):
         at = np.arange(first, first + len(median))
         tables[kind] = pd.DataFrame(dict(at=at, lower=lower, median=median, upper=upper))
     return tables

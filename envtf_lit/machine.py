@@ -34,12 +34,19 @@ def bench_device(name: str | None) -> torch.device:
     return device
 
 
-def facts(device: torch.device, precision: Precision) -> dict[str, Any]:
-    """Device, threads, load and versions: what belongs beside every figure."""
+def hardware(device: torch.device) -> dict[str, Any]:
+    """The device by its name, and the CPU's cores."""
     named = getattr(torch.get_device_module(device), "get_device_name", None)
     return {
         "device": f"{device.type} ({platform.processor() or platform.machine()})" if named is None else named(device),
         "cores": os.cpu_count(),
+    }
+
+
+def facts(device: torch.device, precision: Precision) -> dict[str, Any]:
+    """Device, threads, load and versions: what belongs beside every timing."""
+    return {
+        **hardware(device),
         "threads": torch.get_num_threads(),
         "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "precision": precision,
