@@ -4,6 +4,7 @@ The transformer, the same transformer with a context of one step, and the ensemb
 measured of these three, and models that lie there already, trained with the same settings, are not trained again.
 """
 
+import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +18,7 @@ import lightning as L
 import torch
 
 from envtf_lit import pipeline
+from envtf_lit.data.behaviour import describe_origin
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import load_dataset
 from envtf_lit.errors import UserError, did_you_mean
@@ -31,6 +33,7 @@ from envtf_lit.world_models.store import load_world_model
 
 MODELS = ("transformer", "context_1", "ensemble")  # their names in every table, figure and file
 PHYSICS = "physics"  # what stands beside them under that name, so that no other model may have it
+WORDS = ("trained_with", "note")  # of a dataset's origin: about the whole series, of which a tier may use a part
 WORK = Path(".envtf/suite")  # where suites are kept unless told otherwise
 
 
@@ -113,7 +116,7 @@ def heading(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]
 
     `kept` asks for neither of the latter: the models' bytes tell how they were trained, and the machine hardly counts.
     """
-    ensemble = {f"suite.ensemble.{name}": value for name, value in _plain(options.ensemble).items()}
+    ensemble = {f"suite.ensemble.{name}": value for name, value in _plain(asdict(options.ensemble)).items()}
     machine = {f"machine.{name}": value for name, value in hardware(pick_device()).items()}
     return flat_settings(tier, options, **measured) | ensemble | machine
 
@@ -178,9 +181,13 @@ def build_suite(
         if name not in MODELS:
             raise UserError(f"Unknown model {name!r}: {did_you_mean(name, MODELS)}")
     home, params = root / task, {name: model_params(name, task, options) for name in models}
-    origin = {"task": task, "transitions": options.transitions, "seed": options.seed}
-    shared = replace(Params(), task=task, **_common(options))
-    _unless_done(home / "data.json", origin, lambda: pipeline.download(shared, home, progress=progress))
+    key = {"task": task, "transitions": options.transitions, "seed": options.seed}
+    origin = _plain(describe_origin(get_task(task), options.transitions, options.seed))
+    key |= {"origin": {name: value for name, value in origin.items() if name not in WORDS}}
+    shared, card = replace(Params(), task=task, **_common(options)), home / pipeline.CARD
+    # a record that is older than this key is judged by the dataset's card
+    older = {"origin": {name: read_json(card).get(name) for name in key["origin"]}} if card.exists() else {}
+    _unless_done(home / "data.json", key, lambda: pipeline.download(shared, home, progress=progress), older)
     suite = Suite(task, get_task(task).robot, options, home / pipeline.DATASET, {}, {}, {})
     for name in models:
         add_model(suite, name, params[name].train_model, progress=progress)
@@ -203,17 +210,28 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
     home, shared = suite.dataset.parents[1], suite.options
     params = replace(Params(), task=suite.task, train_model=options, **_common(shared))
     key = {"task": suite.task, "transitions": shared.transitions, "seed": shared.seed}
-    key |= {"threads": shared.threads, "precision": shared.precision, "train_model": _plain(options)}
+    key |= {"threads": shared.threads, "precision": shared.precision, "train_model": _plain(asdict(options))}
+    key |= {"dataset": _digest(suite.dataset)}
     suite.folders[name] = home / "models" / name
     train = partial(_train, params, suite.dataset, suite.folders[name], home, progress)
-    suite.seconds[name] = _unless_done(home / "models" / f"{name}.json", key, train)
+    record = home / "models" / f"{name}.json"
+    # an option that is younger than the record had its default when that was written
+    older: dict[str, Any] = {"train_model": _plain(asdict(TrainModelOptions()))}
+    if record.exists() and record.stat().st_mtime >= suite.dataset.stat().st_mtime:  # trained on what lies there
+        older["dataset"] = key["dataset"]
+    suite.seconds[name] = _unless_done(record, key, train, older)
     epochs = len((suite.folders[name] / "curves.csv").read_text().splitlines()) - 1  # the first line names columns
     suite.updates[name] = epochs * (options.ensemble or options).updates_per_epoch
 
 
-def _plain(options: TrainModelOptions | EnsembleOptions) -> dict[str, Any]:
+def _plain(options: dict[str, Any]) -> dict[str, Any]:
     """As JSON has them, with lists for tuples."""
-    return json.loads(json.dumps(asdict(options)))
+    return json.loads(json.dumps(options))
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _common(options: SuiteOptions) -> dict[str, Any]:
@@ -241,13 +259,11 @@ def model_params(name: str, task: str, options: SuiteOptions) -> Params:
     return params
 
 
-def _unless_done(record: Path, settings: dict[str, Any], work: Callable[[], object]) -> float:
-    """Seconds that the work took, now or when it was done with the same settings."""
+def _unless_done(record: Path, settings: dict[str, Any], work: Callable[[], object], older: dict[str, Any]) -> float:
+    """Seconds that the work took, now or when it was done with the same settings; `older` completes old records."""
     if record.exists():
         done = read_json(record)
-        # an option that is younger than the record had its default when that was written
-        defaults = {"train_model": _plain(TrainModelOptions())} if "train_model" in settings else {}
-        if _over(defaults, done.get("settings")) == settings:
+        if _over(older, done.get("settings")) == settings:
             return done["seconds"]
     record.unlink(missing_ok=True)  # what lies there is about to be replaced
     begin = time.perf_counter()

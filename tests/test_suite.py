@@ -1,12 +1,14 @@
 """The models that are compared: trained once with the same settings, and anew with others."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from envtf_lit import load_world_model
+from envtf_lit import suite as suite_module
 from envtf_lit.errors import UserError
 from envtf_lit.params import EnsembleOptions, ModelOptions, TrainModelOptions
 from envtf_lit.suite import MODELS, SuiteOptions, add_model, build_suite, other_folders
@@ -22,7 +24,9 @@ TINY = SuiteOptions(transitions=1_000, updates=2, ensemble=ENSEMBLE, threads=1)
 
 
 @pytest.mark.filterwarnings("ignore:.*treespec, LeafSpec:FutureWarning")
-def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(tmp_path: Path) -> None:
+def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     suite = build_suite("hopper-medium", tmp_path, TINY, progress=False)
     assert tuple(suite.folders) == MODELS == tuple(suite.seconds)
     transformer, context_1, ensemble = (load_world_model(folder) for folder in suite.folders.values())
@@ -38,6 +42,12 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(tmp_path: Path
     older = json.loads(record.read_text())
     del older["settings"]["train_model"]["model"]["bounded"]  # as if written before there was that option
     record.write_text(json.dumps(older))
+    origin = json.loads((tmp_path / "hopper-medium/data.json").read_text())
+    for path in (record, tmp_path / "hopper-medium/data.json"):  # as if written before datasets were told apart
+        content = json.loads(path.read_text())
+        for name in ("dataset", "origin"):
+            content["settings"].pop(name, None)
+        path.write_text(json.dumps(content))
     assert build_suite("hopper-medium", tmp_path, TINY, progress=False) == suite
     options = TrainModelOptions(ModelOptions(layers=1, heads=1, width=8, bounded=True), updates=2, updates_per_epoch=2)
     add_model(suite, "bounded", options, progress=False)
@@ -48,6 +58,20 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(tmp_path: Path
     build_suite("hopper-medium", tmp_path, changed, progress=False)
     anew = {path for path, time in written.items() if path.stat().st_mtime_ns != time}
     assert anew == {suite.folders["ensemble"] / "weights.safetensors"}
+
+    calls = list[str]()
+    monkeypatch.setattr(suite_module.pipeline, "download", lambda *arguments, **options: calls.append("data"))
+    monkeypatch.setattr(suite_module, "_train", lambda *arguments: calls.append("model"))
+    os.utime(record)
+    card = tmp_path / "hopper-medium/data/dataset.json"
+    returned = origin["settings"]["origin"]["policies"][0]["mean_return_deterministic"]
+    card.write_text(card.read_text().replace(str(returned), "1.5"))  # as if by another zoo's policy
+    build_suite("hopper-medium", tmp_path, TINY, models=["transformer"], progress=False)
+    assert calls == ["data"]  # its record was one of before: the card told
+    with suite.dataset.open("ab") as stream:
+        stream.write(b"other bytes")
+    build_suite("hopper-medium", tmp_path, TINY, models=["transformer", "context_1"], progress=False)
+    assert calls == ["data", "model", "model"]
 
 
 def test_unknown_models_and_bad_budgets_are_refused_before_any_work(tmp_path: Path) -> None:
