@@ -13,6 +13,7 @@ from pathlib import Path
 
 from envtf_lit.horizon import HorizonOptions, compare
 from envtf_lit.params import ModelOptions, TrainModelOptions
+from envtf_lit.storage import write_json
 from envtf_lit.suite import WORK, SuiteOptions, add_model, build_suite
 from envtf_lit.tasks import ROBOTS
 
@@ -63,7 +64,7 @@ def main() -> None:
         add_model(suite, name, train)
         sys.stdout.write(f"{name}: trained in {suite.seconds[name]:.0f} s\n")
         sys.stdout.flush()
-    compare(
+    numbers = compare(
         given.out,
         robots=[given.robot],
         tier=given.tier,
@@ -72,6 +73,7 @@ def main() -> None:
         measured=HorizonOptions(given.trajectories, given.online),
         others={name: str(suite.folders[name]) for name in wanted},
     )
+    write_json(given.out, numbers | suite.costs)  # the remedies', too, which are none of the suite's own models
     sys.stdout.write(given.out.with_suffix(".md").read_text())
 
 
