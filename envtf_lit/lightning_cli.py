@@ -15,6 +15,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from rich.console import Console
 
+from envtf_lit import pipeline
 from envtf_lit.agents.cql import CQL
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import load_dataset
@@ -22,10 +23,9 @@ from envtf_lit.data.loaders import TransitionData, WindowData
 from envtf_lit.data.minari_sets import read_minari
 from envtf_lit.errors import UserError
 from envtf_lit.params import PolicyOptions, TrainModelOptions
-from envtf_lit.policy import save_policy
 from envtf_lit.storage import read_json, replacing
+from envtf_lit.training import Curves
 from envtf_lit.world_models.lit import LitEnsemble, LitWorldModel, lit_world_model, window_options
-from envtf_lit.world_models.store import save_world_model
 
 CONFIGS = Path(__file__).parent / "configs"
 SHIPPED = ", ".join(sorted(path.stem for path in CONFIGS.glob("*.yaml")))
@@ -132,25 +132,36 @@ class LogTransitions(_Sourced, TransitionData):
 
 
 class Publish(Callback):
-    """Writes what was trained as a model folder, for `load_world_model` or `load_policy`, beside the run's logs."""
+    """Writes what was trained as a model folder, as the pipeline's stages do, beside the run's logs."""
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         # by all processes: each may hold a part of the weights
         state, folder = trainer.strategy.lightning_module_state_dict(), _folder(trainer) / "published"
         if not trainer.is_global_zero:
             return
-        weights = "members at their best" if isinstance(pl_module, LitEnsemble) else "last update"
+        curves = _curves(trainer)
+        weights, row = "last update", curves.rows[-1] if curves.rows else {}
+        if isinstance(pl_module, LitEnsemble):
+            weights = "members at their best"
         if (checkpoint := _best(trainer)) is not None:
-            state = torch.load(checkpoint.best_model_path, map_location="cpu", weights_only=True)["state_dict"]
+            saved = torch.load(checkpoint.best_model_path, map_location="cpu", weights_only=True)
+            state, row = saved["state_dict"], next((r for r in curves.rows if r["epoch"] == saved["epoch"] + 1), {})
             weights = f"epoch of best {checkpoint.monitor}, {checkpoint.best_model_score:.4g}"
         module = type(pl_module)(**pl_module.hparams).to(pl_module.device)  # whole, however the other one is spread
         module.load_state_dict(state)
+        settings = dict(pl_module.hparams)
         if isinstance(module, LitWorldModel):
-            module.fit_uncertainty(trainer.datamodule)  # pyright: ignore[reportAttributeAccessIssue]
-            save_world_model(folder, module.kept)
+            data: WindowData = trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
+            pipeline.publish_world_model(folder, module, data, curves, row, settings)
         elif isinstance(module, CQL):
-            save_policy(folder, module.average_actor)
+            pipeline.publish_policy(folder, module.average_actor, curves, row, settings)
         Console().print(f"Published the weights of the {weights}: {folder}", highlight=False, soft_wrap=True)
+
+
+def _curves(trainer: L.Trainer) -> Curves:
+    """What was logged, as `instantiate_trainer` has it noted."""
+    callbacks: list[Callback] = trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
+    return next(callback for callback in callbacks if isinstance(callback, Curves))
 
 
 def _best(trainer: L.Trainer) -> ModelCheckpoint | None:
@@ -215,6 +226,13 @@ class _LinkedCLI(LightningCLI):
                 return
             begin = args.index(verb) + 1  # below flags: the first --config
             super().parse_arguments(parser, [*args[:begin], "--config", json.dumps({"model": below}), *args[begin:]])
+
+    def instantiate_trainer(self, **kwargs: Any) -> L.Trainer:
+        trainer = super().instantiate_trainer(**kwargs)
+        # only now: Lightning would take it for the callback that saves checkpoints, and make none;
+        # at the front, so that checkpoints hold the row of their epoch
+        trainer.callbacks.insert(0, Curves())  # pyright: ignore[reportAttributeAccessIssue]
+        return trainer
 
     @staticmethod
     def architecture(config: dict[str, Any]) -> dict[str, Any]:

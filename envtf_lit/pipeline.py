@@ -6,7 +6,7 @@ Each reads what the stages before it wrote below `root`, writes its own outputs 
 import contextlib
 import resource
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,14 @@ from typing import Any
 import lightning as L
 import torch
 
+from envtf_lit.errors import UserError
 from envtf_lit.params import Params, PolicyOptions
 from envtf_lit.storage import pick_device, read_json, replacing, write_json
 from envtf_lit.tasks import Robot, get_task, never_terminated
 
 DATASET, CARD = Path("data/dataset.h5"), Path("data/dataset.json")
 TERMINATION = "termination"  # below the world model, where it had to be learned
+CURVES = "curves.csv"  # below every model
 WORLD_MODEL, BEHAVIOUR = Path("models/world_model"), Path("models/behaviour")
 ROLLOUTS, POLICIES = Path("data/rollouts.h5"), Path("models/policy")
 REPORTS, METRICS = Path("reports"), Path("reports/metrics.json")
@@ -71,8 +73,6 @@ def fit_world_model(
     """
     from envtf_lit.training import fit, run_folder
     from envtf_lit.world_models.lit import lit_world_model, window_data
-    from envtf_lit.world_models.store import save_world_model
-    from envtf_lit.world_models.termination import learn_termination, save_termination
 
     options = params.train_model
     budget = options.ensemble or options
@@ -89,22 +89,40 @@ def fit_world_model(
         monitor=lit.monitor,
         gradient_clip=lit.gradient_clip,
     )
-    lit.fit_uncertainty(data)
     best = curves.rows[-1] if (name := lit.monitor) is None else min(curves.rows, key=lambda row: row[name])
-    metrics = {
-        "parameters": sum(p.numel() for p in lit.kept.parameters()),
-        "epoch": int(best["epoch"]),
-        "open_loop_error": best["val/open_loop_error"],
-        "val_loss": best["val/loss"],
-    }
-    head = learn_termination(data.train, seed=params.seed) if data.dataset.task is None else None
+    return publish_world_model(target, lit, data, curves, best, key)
+
+
+def publish_world_model(
+    target: Path, lit: Any, data: Any, curves: Any, best: Mapping[str, float], settings: dict[str, Any]
+) -> dict[str, Any]:
+    """Fits what comes after training, uncertainty and perhaps a termination head, and writes a world model's folder.
+
+    Args:
+        target: folder of the weights, metrics, curves and resolved options.
+        lit: the `LitWorldModel` that holds the weights to keep.
+        data: the `WindowData` that it was trained on, set up.
+        curves: the `Curves` of the training.
+        best: the row of them that belongs to the weights; it may lack what was not logged.
+        settings: the resolved options.
+
+    Returns:
+        As `fit_world_model`.
+    """
+    from envtf_lit.world_models.store import save_world_model
+    from envtf_lit.world_models.termination import learn_termination, save_termination
+
+    lit.fit_uncertainty(data)
+    names = {"epoch": "epoch", "open_loop_error": "val/open_loop_error", "val_loss": "val/loss"}
+    metrics: dict[str, Any] = {"parameters": sum(p.numel() for p in lit.kept.parameters())}
+    metrics |= {name: best[column] for name, column in names.items() if column in best}
+    head = learn_termination(data.train, seed=lit.seed) if data.dataset.task is None else None
     with replacing(target) as folder:
         save_world_model(folder, lit.kept)
         if head is not None:
             save_termination(folder / TERMINATION, head)
             metrics |= head.scores(data.held_out)
-        _record(folder, metrics, key)
-        curves.write(folder / "curves.csv")
+        _record(folder, metrics, settings, curves)
     return metrics
 
 
@@ -133,7 +151,7 @@ def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool 
         )
         with replacing(root / BEHAVIOUR) as folder:
             save_policy(folder, clone)
-            curves.write(folder / "curves.csv")
+            curves.write(folder / CURVES)
         device = pick_device()
         model = load_world_model(root / WORLD_MODEL).to(device)
         generator = torch.Generator(device).manual_seed(params.seed)
@@ -169,7 +187,6 @@ def train_policy(
     """Trains `cql` (data alone) or `et_cql` (data and imagination): `models/policy/<algorithm>/`."""
     from envtf_lit.agents.cql import CQL
     from envtf_lit.data.loaders import TransitionData
-    from envtf_lit.policy import save_policy
     from envtf_lit.training import fit, run_folder
 
     options: PolicyOptions = getattr(params.train_policy, algorithm)
@@ -211,11 +228,30 @@ def train_policy(
             validate=False,
         )
         kept = max(curves.rows, key=lambda row: row[monitor]) if monitor else curves.rows[-1]
-        metrics = {name.rpartition("/")[2]: value for name, value in kept.items()}
-        with replacing(root / POLICIES / algorithm) as folder:
-            save_policy(folder, agent.average_actor)
-            _record(folder, metrics, key)
-            curves.write(folder / "curves.csv")
+        return publish_policy(root / POLICIES / algorithm, agent.average_actor, curves, kept, key)
+
+
+def publish_policy(
+    target: Path, actor: Any, curves: Any, kept: Mapping[str, float], settings: dict[str, Any]
+) -> dict[str, Any]:
+    """Writes a policy's folder.
+
+    Args:
+        target: folder of the weights, metrics, curves and resolved options.
+        actor: the `TanhGaussianActor` to keep.
+        curves: the `Curves` of the training.
+        kept: the row of them that belongs to the actor.
+        settings: the resolved options.
+
+    Returns:
+        The row, its columns named without their split.
+    """
+    from envtf_lit.policy import save_policy
+
+    metrics = {name.rpartition("/")[2]: value for name, value in kept.items()}
+    with replacing(target) as folder:
+        save_policy(folder, actor)
+        _record(folder, metrics, settings, curves)
     return metrics
 
 
@@ -225,8 +261,6 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
     The model is scored on held-out episodes, policies in MuJoCo. For a robot without a simulator (`task: null`) there
     are no scores: what the model promises the policies, and how they agree with held-out actions, is all.
     """
-    import pandas as pd
-
     from envtf_lit.data.formats import load_dataset
     from envtf_lit.evaluation.evidence import collect_metrics, collect_promises, world_model_metrics
     from envtf_lit.evaluation.offline import judge
@@ -249,7 +283,7 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         report = horizon_report(model, whole_episodes(held_out, options.trajectories, seed=params.seed), scale)
         folders = {"bc": BEHAVIOUR, **{name: POLICIES / name for name in ALGORITHMS}}
         policies = {name: load_policy(root / folder) for name, folder in folders.items()}
-        curves = {name: pd.read_csv(root / POLICIES / name / "curves.csv") for name in ALGORITHMS}
+        curves = {name: _curves(root / POLICIES / name) for name in ALGORITHMS}
         facts: dict[str, Any] = dict(
             seed=params.seed,
             dataset=dataset,
@@ -261,7 +295,7 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
             plots.mkdir()
             video.mkdir()
             gallery.draw_dataset(dataset, source, plots)
-            gallery.draw_world_model(report, scale, robot, pd.read_csv(root / WORLD_MODEL / "curves.csv"), plots)
+            gallery.draw_world_model(report, scale, robot, _curves(root / WORLD_MODEL), plots)
             gallery.draw_rollouts(rollouts.step.numpy(), rollouts.uncertainty.numpy(), plots)
             if robot is None:
                 promises = judge(model, policies, report, training)
@@ -346,10 +380,23 @@ def _key(params: Params, options: dict[str, Any]) -> dict[str, Any]:
     return {"seed": params.seed, "threads": params.threads, "precision": params.precision, "options": options}
 
 
-def _record(folder: Path, metrics: dict[str, Any], key: dict[str, Any]) -> None:
-    """Metrics and resolved options beside the weights."""
+def _record(folder: Path, metrics: dict[str, Any], settings: dict[str, Any], curves: Any) -> None:
+    """Metrics, resolved options and curves beside the weights."""
     write_json(folder / "metrics.json", metrics)
-    write_json(folder / "resolved.json", key)
+    write_json(folder / "resolved.json", settings)
+    curves.write(folder / CURVES)
+
+
+def _curves(folder: Path) -> Any:
+    import pandas as pd
+
+    try:
+        return pd.read_csv(folder / CURVES)
+    except (FileNotFoundError, pd.errors.EmptyDataError):
+        raise UserError(
+            f"{folder} has no {CURVES}, which the plots are drawn from: run the stage that writes the folder, or copy "
+            "one there that `fit` published after an epoch or more."
+        ) from None
 
 
 @contextlib.contextmanager

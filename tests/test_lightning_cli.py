@@ -8,6 +8,7 @@ from pathlib import Path
 
 import lightning as L
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -17,8 +18,11 @@ from envtf_lit.cli import main
 from envtf_lit.data.formats import load_dataset, save_dataset
 from envtf_lit.data.loaders import TransitionData, Transitions
 from envtf_lit.data.minari_sets import write_minari
+from envtf_lit.errors import UserError
 from envtf_lit.params import Params, PolicyOptions
+from envtf_lit.storage import read_json
 from envtf_lit.world_models.ensemble import EnsembleDynamics
+from tests.test_no_environment import own_log, own_params
 from tests.walker import walker_dataset
 
 SIZES = {
@@ -153,6 +157,31 @@ def test_model_fit_publishes_and_starts_from_published_weights(folder: Path) -> 
     assert not same(first.blocks, load_world_model(".envtf/published").blocks)
 
 
+@pytest.mark.filterwarnings("ignore:.*treespec, LeafSpec:FutureWarning")
+def test_the_stages_take_what_fit_published(folder: Path) -> None:
+    save_dataset(replace(own_log(), task=None), "log.npz")
+    params = own_params(folder / "log.npz")
+    pipeline.download(params, progress=False)
+    few = ["--model.options.updates=4", "--model.options.updates_per_epoch=1", "--model.options.learning_rate=0.1"]
+    fit("model", "--config=finetune", *few, held_out=0.25)
+    curves, metrics = pd.read_csv(".envtf/published/curves.csv"), read_json(".envtf/published/metrics.json")
+    errors = curves["val/open_loop_error"]
+    assert (metrics["epoch"], metrics["open_loop_error"]) == (curves["epoch"][errors.argmin()], errors.min())
+    assert len(curves) == 4 and 0 <= metrics["termination_false_alarms"] <= 1
+    Path("models/policy").mkdir(parents=True)
+    Path(".envtf/published").rename("models/world_model")
+    pipeline.generate_rollouts(params, progress=False)
+    for name in pipeline.ALGORITHMS:
+        fit("agent")
+        Path(".envtf/published").rename(Path("models/policy", name))
+    metrics = pipeline.evaluate(params, progress=False)
+    assert metrics["world_model"]["termination"] == "learned"
+    assert Path("reports/plots/policy_curves.png").exists()
+    Path("models/policy/cql/curves.csv").unlink()
+    with pytest.raises(UserError, match=r"models/policy/cql has no curves\.csv"):
+        pipeline.evaluate(params, progress=False)
+
+
 def another_robot() -> None:
     """The project's dataset becomes one of 8 observations and 2 actions."""
     data = walker_dataset(seed=1)
@@ -272,6 +301,11 @@ def test_a_continued_run_keeps_the_checkpoints_options_where_no_flag_differs(kin
     assert after["hyper_parameters"] == before["hyper_parameters"] and before["hyper_parameters"]["seed"] == 3
 
 
+def written() -> dict[str, bytes]:
+    """Name and bytes of every file that fit published."""
+    return {path.name: path.read_bytes() for path in sorted(Path(".envtf/published").iterdir())}
+
+
 @pytest.mark.parametrize("kind", ["model", "agent"])
 @pytest.mark.parametrize("tuned", [False, True])
 def test_a_continued_run_equals_an_uninterrupted_one(kind: str, tuned: bool, folder: Path) -> None:
@@ -289,11 +323,11 @@ def test_a_continued_run_equals_an_uninterrupted_one(kind: str, tuned: bool, fol
     if tuned:
         Path("base").rename("elsewhere")  # a continued run needs it no more
     envtf(kind, "fit", NO_LOGGER, f"--ckpt_path={checkpoint}")
-    resumed = Path(".envtf/published/weights.safetensors").read_bytes()
+    resumed = written()
     if tuned:
         Path("elsewhere").rename("base")
     fit(kind, *flags, **options)
-    assert Path(".envtf/published/weights.safetensors").read_bytes() == resumed
+    assert written() == resumed
 
 
 def test_model_test_equals_validate_and_needs_no_options_beside_the_checkpoint(
