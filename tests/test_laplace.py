@@ -100,12 +100,12 @@ class Toy(nn.Module):
         self.head, self.laplace = nn.Linear(64, outputs), LastLayerLaplace(64, 1)
 
 
-def train_toy(objective: str) -> tuple[Toy, Tensor, Tensor]:
+def train_toy(objective: str, *, learning_rate: float = 3e-3) -> tuple[Toy, Tensor, Tensor]:
     torch.manual_seed(0)
     generator = torch.Generator().manual_seed(0)
     x, y = toy_data(1_000, generator)
     toy = Toy(2 if objective == "beta_nll" else 3)
-    optimizer = torch.optim.Adam(toy.parameters(), lr=3e-3)
+    optimizer = torch.optim.Adam(toy.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 1_500)
     for _ in range(1_500):
         rows = torch.randint(len(x), (256,), generator=generator)
@@ -142,11 +142,11 @@ def test_a_toy_with_a_gap_is_calibrated_and_its_gap_is_seen():
 
 
 def test_the_papers_loss_drives_the_spread_to_nothing():
-    toy, x, _ = train_toy("paper_mse")
+    toy, x, _ = train_toy("paper_mse", learning_rate=1e-2)  # sooner there
     with torch.no_grad():
         _, aleatoric, epistemic = toy.head(toy.trunk(x)).split(1, dim=-1)
         spread = torch.sqrt(aleatoric.exp() + epistemic.exp())
-    assert float((spread / noise(x)).mean()) < 0.5  # and falling
+    assert float((spread / noise(x)).mean()) < 0.1  # and falling
 
 
 def test_default_epistemic_variance_is_the_posterior():
