@@ -318,8 +318,8 @@ def _advance(
 def _novelty(prediction: Prediction) -> Tensor:
     if prediction.novelty is None:
         raise UserError(
-            "novelty_limit is set and the world model has no epistemic variance to hold against it: train one with "
-            "epistemic: laplace, or set novelty_limit to null."
+            "novelty_limit is set and the world model has no epistemic variance to hold against it: train a "
+            "transformer with epistemic: laplace or an ensemble of several members, or set novelty_limit to null."
         )
     return prediction.novelty
 

@@ -22,9 +22,10 @@ from envtf_lit.data.formats import load_dataset
 from envtf_lit.data.loaders import TransitionData, WindowData
 from envtf_lit.data.minari_sets import read_minari
 from envtf_lit.errors import UserError
-from envtf_lit.params import PolicyOptions, TrainModelOptions
+from envtf_lit.params import Params, PolicyOptions, TrainModelOptions
 from envtf_lit.storage import read_json, replacing
 from envtf_lit.training import Curves
+from envtf_lit.validation import build_section, check_no_imagination, check_policy, check_world_model
 from envtf_lit.world_models.lit import LitEnsemble, LitWorldModel, lit_world_model, window_options
 
 CONFIGS = Path(__file__).parent / "configs"
@@ -41,6 +42,7 @@ TRUST = (
     f"{SHIPPED}."
 )
 
+SECTION = "model.options"  # of the command line, which errors name
 LIGHTNINGS_OWN = re.compile(r"(best|last|hpc|registry.*|\w+://.*)$")  # checkpoints that are not local paths
 
 
@@ -239,15 +241,26 @@ class _LinkedCLI(LightningCLI):
         """The options that a published folder's weights ask for, given its config.json."""
         raise NotImplementedError
 
+    @staticmethod
+    def check(options: Any) -> None:
+        """The rules that tie these options together, as for params.yaml.
+
+        Raises:
+            UserError: one is broken.
+        """
+        raise NotImplementedError
+
     def _parse_ckpt_path(self) -> None:
         """Lightning would let the checkpoint's options win over flags; see `parse_arguments`."""
 
     def before_instantiate_classes(self) -> None:
         config = self.config[str(self.subcommand)]
         options, trainer = config.model.options, config.trainer
+        self.check(build_section(self.options, _plain(options), SECTION))
+        build_section(Params, {"seed": config.model.seed}, "model")
         budget = _unwrapped(options).get("ensemble") or options
         if trainer.max_epochs is None and trainer.max_steps == -1:
-            trainer.max_epochs = max(1, budget.updates // budget.updates_per_epoch)
+            trainer.max_epochs = budget.updates // budget.updates_per_epoch
         if trainer.gradient_clip_val is None:  # refused under the agents' manual optimisation, and they have none
             trainer.gradient_clip_val = budget.get("gradient_clip")
 
@@ -263,6 +276,10 @@ class ModelCLI(_LinkedCLI):
     def architecture(config: dict[str, Any]) -> dict[str, Any]:
         arguments = _arguments(config, ("observation_dim", "action_dim"))
         return {"ensemble": arguments} if config.get("kind") == "ensemble_dynamics" else {"model": arguments}
+
+    @staticmethod
+    def check(options: TrainModelOptions) -> None:
+        check_world_model(options, SECTION)
 
     def link_more(self, parser: LightningArgumentParser) -> None:
         for name in ("context", "batch_size", "updates_per_epoch", "members"):
@@ -288,9 +305,14 @@ class AgentCLI(_LinkedCLI):
     def architecture(config: dict[str, Any]) -> dict[str, Any]:
         return {name: value for name, value in _arguments(config).items() if name == "hidden"}
 
+    @staticmethod
+    def check(options: PolicyOptions) -> None:
+        check_no_imagination(options, SECTION)
+        check_policy(options, SECTION)
+
     def link_more(self, parser: LightningArgumentParser) -> None:
         updates = ("model.options.updates_per_epoch", "model.options.updates_per_step")
-        parser.link_arguments(updates, "data.steps_per_epoch", compute_fn=lambda epoch, step: max(1, epoch // step))
+        parser.link_arguments(updates, "data.steps_per_epoch", compute_fn=lambda epoch, step: epoch // (step or 1))
 
 
 def _window_option(name: str) -> Callable[[Namespace], Any]:
@@ -301,6 +323,12 @@ def _unwrapped(options: Namespace) -> Any:
     """The ensemble's options as plain attributes: while jsonargparse links, it wraps an optional dataclass."""
     ensemble = options.get("ensemble") or Namespace()
     return Namespace({**vars(options), "ensemble": ensemble.get("init_args", ensemble) or None})
+
+
+def _plain(options: Namespace) -> dict[str, Any]:
+    """The options as nested dictionaries, whatever jsonargparse wraps around optional dataclasses."""
+    values = {name: _plain(value) if isinstance(value, Namespace) else value for name, value in vars(options).items()}
+    return values.get("init_args", values)
 
 
 def _saved_options(checkpoint: str, kind: type[TrainModelOptions] | type[PolicyOptions]) -> dict[str, Any]:

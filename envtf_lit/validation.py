@@ -79,6 +79,20 @@ def build_params(values: Mapping[str, Any]) -> Params:
     return params
 
 
+def build_section(cls: type, values: Mapping[str, Any], section: str) -> Any:
+    """One options class from a tree of plain values, types and ranges checked.
+
+    Args:
+        cls: of the options, such as `TrainModelOptions`.
+        values: by name; what is absent takes its default.
+        section: what errors call it, such as `train_model`.
+
+    Raises:
+        UserError: an unknown option, or a value of the wrong type or out of range.
+    """
+    return _dataclass(cls, values, section)
+
+
 def _refuse(key: str, value: Any, expected: str) -> typing.NoReturn:
     shown = "null" if value is None else repr(value)
     raise UserError(f"{key or 'The top level'} is {shown}, expected {expected}.")
@@ -145,7 +159,7 @@ def check_rules(params: Params) -> None:
     check_world_model(params.train_model)
     _check_policies(params)
     _check_epistemic(params)
-    _check_history("generate_rollouts", params.generate_rollouts.history, params.train_model.model)
+    _check_history("generate_rollouts", params.generate_rollouts.history, params.train_model)
 
 
 def check_download(options: DownloadOptions, *, named: bool) -> None:
@@ -182,70 +196,97 @@ def check_ranges(params: Params) -> None:
     _dataclass(Params, dataclasses.asdict(params), "")
 
 
-def check_world_model(options: TrainModelOptions) -> None:
-    """The rules that tie the world model's options together.
+def check_world_model(options: TrainModelOptions, section: str = "train_model") -> None:
+    """The rules that tie the world model's options together; what an ensemble does not read may be anything.
+
+    Args:
+        options: of model and training.
+        section: what errors call them.
 
     Raises:
         UserError: one is broken.
     """
-    _check_model(options.model)
-    _check_epochs("train_model", options)
-    if options.ensemble is not None:
-        _check_epochs("train_model.ensemble", options.ensemble)
-        _check_ensemble(options.ensemble)
+    if options.ensemble is None:
+        _check_model(f"{section}.model", options.model)
+        _check_epochs(section, options)
+    else:
+        _check_epochs(f"{section}.ensemble", options.ensemble)
+        _check_ensemble(f"{section}.ensemble", options.ensemble)
 
 
-def _check_model(model: ModelOptions) -> None:
+def check_policy(options: PolicyOptions, section: str) -> None:
+    """The rules that tie a policy's options together, whether or not it imagines.
+
+    Args:
+        options: of the policy.
+        section: what errors call them.
+
+    Raises:
+        UserError: one is broken.
+    """
+    _check_epochs(section, options)
+    if options.updates_per_epoch % options.updates_per_step:
+        raise UserError(
+            f"{section}.updates_per_epoch is {options.updates_per_epoch}: take a multiple of updates_per_step "
+            f"({options.updates_per_step})."
+        )
+    if options.warm_start > options.updates:
+        raise UserError(
+            f"{section}.warm_start is {options.warm_start}, more than its updates ({options.updates}): the warm start "
+            "is a part of them."
+        )
+
+
+def check_no_imagination(options: PolicyOptions, section: str) -> None:
+    """A policy that sees data alone has no section for imagination.
+
+    Raises:
+        UserError: it has one.
+    """
+    if options.imagination is not None:
+        raise UserError(f"{section}.imagination must be null: this policy sees data alone, et_cql imagines.")
+
+
+def _check_model(section: str, model: ModelOptions) -> None:
     if model.width % (2 * model.heads):
         raise UserError(
-            f"train_model.model.width is {model.width} and heads is {model.heads}: each head needs an even share, so "
-            f"take a width that is a multiple of {2 * model.heads}."
+            f"{section}.width is {model.width} and heads is {model.heads}: each head needs an even share, so take a "
+            f"width that is a multiple of {2 * model.heads}."
         )
 
     if model.objective == "paper_mse" and model.epistemic != "head":
         raise UserError(
-            f"train_model.model.objective is paper_mse and epistemic is {model.epistemic}: that objective trains the "
-            "paper's third head, so set epistemic to head."
+            f"{section}.objective is paper_mse and epistemic is {model.epistemic}: that objective trains the paper's "
+            "third head, so set epistemic to head."
         )
 
 
-def _check_ensemble(options: EnsembleOptions) -> None:
+def _check_ensemble(section: str, options: EnsembleOptions) -> None:
     if options.elites > options.members:
         raise UserError(
-            f"train_model.ensemble.elites is {options.elites} and members is {options.members}: elites are chosen from "
-            "the members, so take no more than those."
+            f"{section}.elites is {options.elites} and members is {options.members}: elites are chosen from the "
+            "members, so take no more than those."
         )
     if len(options.weight_decay) != len(options.hidden) + 1:
         raise UserError(
-            f"train_model.ensemble.weight_decay has {len(options.weight_decay)} entries and there are "
-            f"{len(options.hidden) + 1} layers, the output layer among them: give one for each."
+            f"{section}.weight_decay has {len(options.weight_decay)} entries and there are {len(options.hidden) + 1} "
+            "layers, the output layer among them: give one for each."
         )
 
 
 def _check_policies(params: Params) -> None:
     policies = params.train_policy
-    if policies.cql.imagination is not None:
-        raise UserError("train_policy.cql.imagination must be null: this policy sees data alone, et_cql imagines.")
+    check_no_imagination(policies.cql, "train_policy.cql")
     if policies.et_cql.imagination is None:
         raise UserError(
             "train_policy.et_cql.imagination is null: give it a section, since train_policy.cql is without."
         )
-    for name, options in (("cql", policies.cql), ("et_cql", policies.et_cql)):
-        _check_epochs(f"train_policy.{name}", options)
-        if options.updates_per_epoch % options.updates_per_step:
-            raise UserError(
-                f"train_policy.{name}.updates_per_epoch is {options.updates_per_epoch}: take a multiple of "
-                f"updates_per_step ({options.updates_per_step})."
-            )
-        if options.warm_start > options.updates:
-            raise UserError(
-                f"train_policy.{name}.warm_start is {options.warm_start}, more than its updates ({options.updates}): "
-                "the warm start is a part of them."
-            )
-    _check_imagination(policies.et_cql, policies.et_cql.imagination, params.train_model.model)
+    check_policy(policies.cql, "train_policy.cql")
+    check_policy(policies.et_cql, "train_policy.et_cql")
+    _check_imagination(policies.et_cql, policies.et_cql.imagination, params.train_model)
 
 
-def _check_imagination(policy: PolicyOptions, imagination: ImaginationOptions, model: ModelOptions) -> None:
+def _check_imagination(policy: PolicyOptions, imagination: ImaginationOptions, model: TrainModelOptions) -> None:
     section, climbing = "train_policy.et_cql.imagination", imagination.value_gradient
     _check_history(section, imagination.history, model)
     if climbing is None:
@@ -263,19 +304,30 @@ def _check_imagination(policy: PolicyOptions, imagination: ImaginationOptions, m
 
 
 def _check_epistemic(params: Params) -> None:
-    imagination, epistemic = params.train_policy.et_cql.imagination, params.train_model.model.epistemic
+    imagination, train = params.train_policy.et_cql.imagination, params.train_model
     assert imagination is not None
     for key, value in (
         ("generate_rollouts.novelty_limit", params.generate_rollouts.novelty_limit),
         ("train_policy.et_cql.imagination.novelty_limit", imagination.novelty_limit),
         ("train_policy.et_cql.imagination.posterior", imagination.posterior or None),
     ):
-        if value is not None and epistemic != "laplace":
-            off = 0 if key.endswith("posterior") else "null"
-            raise UserError(
-                f"{key} is {value} and train_model.model.epistemic is {epistemic}, which has no posterior: set the one "
-                f"to {off}, or the other to laplace."
-            )
+        drawn = key.endswith("posterior")
+        lacking = _lacking(train, drawn=drawn)
+        if value is not None and lacking is not None:
+            raise UserError(f"{key} is {value} and {lacking}, or the first to {0 if drawn else 'null'}.")
+
+
+def _lacking(options: TrainModelOptions, *, drawn: bool) -> str | None:
+    """What leaves a world model without epistemic variance, or without a posterior to be drawn from, and the remedy."""
+    ensemble, epistemic = options.ensemble, options.model.epistemic
+    if ensemble is None:
+        if epistemic == "laplace":
+            return None
+        return f"train_model.model.epistemic is {epistemic}, which has no posterior: set that to laplace"
+    name = "elites" if drawn else "members"  # rollouts follow an elite; all members disagree
+    if getattr(ensemble, name) > 1:
+        return None
+    return f"train_model.ensemble.{name} is 1, which has no other to differ from: set that to 2 or more"
 
 
 def _check_epochs(section: str, options: TrainModelOptions | EnsembleOptions | PolicyOptions) -> None:
@@ -286,9 +338,10 @@ def _check_epochs(section: str, options: TrainModelOptions | EnsembleOptions | P
         )
 
 
-def _check_history(section: str, history: int, model: ModelOptions) -> None:
-    if history > model.context - 1:
+def _check_history(section: str, history: int, options: TrainModelOptions) -> None:
+    context = options.model.context
+    if options.ensemble is None and history > context - 1:  # an ensemble takes any, and looks at the last step alone
         raise UserError(
-            f"{section}.history is {history} and train_model.model.context is {model.context}: the model remembers at "
-            f"most {model.context - 1} steps before the present one."
+            f"{section}.history is {history} and train_model.model.context is {context}: the model remembers at most "
+            f"{context - 1} steps before the present one."
         )

@@ -134,6 +134,9 @@ REFUSED = {
     "train_policy: {cql: {imagination: {horizon: 1}}}": ["cql.imagination must be null"],
     "train_policy: {et_cql: {imagination: null}}": ["et_cql.imagination is null"],
     "train_policy: {et_cql: {imagination: {horizn: 1}}}": ["'horizn'", "did you mean 'horizon'?"],
+    "train_model: {model: {epistemic: none}}": ["novelty_limit is 1.0", "epistemic is none", "to laplace", "to null"],
+    "train_model: {ensemble: {members: 1, elites: 1}}": ["novelty_limit is 1.0", "members is 1", "to 2", "to null"],
+    "train_model: {ensemble: {elites: 1}}": ["imagination.posterior is 1.0", "elites is 1", "to 2 or more", "to 0"],
     "generate_rollouts: {history: 40}": ["generate_rollouts.history is 40", "at most 15"],
     "download: {source: file}": ["download.path is null", "give the path"],
     "download: {source: minari}": ["download.minari_id is null", "mujoco/hopper/medium-v0"],
@@ -155,6 +158,11 @@ def test_bad_input_is_refused_in_one_sentence(text: str, tmp_path: Path) -> None
     sentence = str(refusal.value)
     assert "\n" not in sentence
     assert [part for part in REFUSED[text] if part not in sentence] == [], sentence
+
+
+def test_what_an_ensemble_does_not_read_may_be_anything(tmp_path: Path) -> None:
+    unread = "updates: 5, model: {epistemic: none, width: 5, context: 1}"
+    assert load(tmp_path, f"train_model: {{{unread}, ensemble: {{}}}}").train_model.model.epistemic == "none"
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

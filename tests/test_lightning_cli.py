@@ -29,6 +29,7 @@ SIZES = {
     "model": {"model.layers": 1, "model.heads": 2, "model.width": 16, "model.context": 4, "batch_size": 8},
     "agent": {"hidden": [8], "updates_per_step": 2, "warm_start": 2, "batch_size": 8},
 }
+STILL = 1e-30  # a learning rate too small to change any bit
 RUN = {"updates_per_epoch": 2, "updates": 4}
 OPTIONS = [f"--model.options.{name}={value}" for name, value in {**SIZES["model"], **RUN}.items()]
 QUIET = ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
@@ -141,11 +142,11 @@ def test_model_fit_trains_the_ensemble_where_its_options_stand(
 def test_model_fit_publishes_and_starts_from_published_weights(folder: Path) -> None:
     fit("model")
     Path(".envtf/published").rename("first")
-    fit("model", "--model.init_from=first", learning_rate=0)
+    fit("model", "--model.init_from=first", learning_rate=STILL)
     first, second = load_world_model("first"), load_world_model(".envtf/published")
     assert same(first, second)  # the scale of the same data changes no bit
     save_dataset(walker_dataset(seed=1), "data/dataset.h5")
-    fit("model", "--model.init_from=first", learning_rate=0)
+    fit("model", "--model.init_from=first", learning_rate=STILL)
     second = load_world_model(".envtf/published")
     assert same(first.blocks, second.blocks)
     assert not torch.equal(first.normaliser.observation_mean, second.normaliser.observation_mean)
@@ -216,6 +217,32 @@ def test_another_robots_policy_keeps_the_frozen_hidden_layers(folder: Path) -> N
 
 
 @pytest.mark.parametrize(
+    ("kind", "options", "sentence"),
+    [
+        ("model", {"updates": 5}, "model.options.updates is 5: take a multiple of its updates_per_epoch (2)"),
+        ("model", {"updates_per_epoch": 0}, "model.options.updates_per_epoch is 0, expected an integer, 1 or more"),
+        ("model", {"model.multi_step": 0}, "model.options.model.multi_step is 0, expected an integer, 1 or more"),
+        ("model", {"model.width": 6}, "model.options.model.width is 6 and heads is 2"),
+        ("model", {"ensemble": '{"hidden": [8]}'}, "model.options.ensemble.weight_decay has 5 entries and there are 2"),
+        ("model", {"ensemble": '{"members": 0}'}, "model.options.ensemble.members is 0, expected an integer, 1"),
+        ("agent", {"updates_per_step": 0}, "model.options.updates_per_step is 0, expected an integer, 1 or more"),
+        ("agent", {"updates_per_epoch": 1, "updates": 4}, "model.options.updates_per_epoch is 1: take a multiple of"),
+        ("agent", {"warm_start": 5}, "model.options.warm_start is 5, more than its updates (4)"),
+        ("agent", {"imagination": "{}"}, "model.options.imagination must be null"),
+    ],
+)
+def test_options_are_held_to_the_ranges_and_rules_of_params(
+    kind: str, options: dict[str, object], sentence: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sentence in refused(capsys, kind, "fit", NO_LOGGER, **{**SIZES[kind], **RUN, **options})
+    assert not Path(".envtf").exists()
+
+
+def test_a_negative_seed_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "model.seed is -1, expected an integer, 0 or more" in refused(capsys, "model", "fit", "--model.seed=-1")
+
+
+@pytest.mark.parametrize(
     ("kind", "parts", "sentence"),
     [
         ("model", "[block]", "no part 'block' to freeze: did you mean 'blocks'?"),
@@ -238,7 +265,7 @@ def test_the_shipped_configuration_stops_early_and_publishes_the_best_epoch(
     capsys.readouterr()
     started = ["model", "fit", "--config=finetune", "--data.path=data/dataset.h5", "--model.init_from=first", NO_LOGGER]
     budget = [*QUIET, *(f"--model.options.{name}=1" for name in ("batch_size", "updates_per_epoch"))]
-    main([*started, *budget, "--model.options.learning_rate=0"])  # nothing can get better
+    main([*started, *budget, f"--model.options.learning_rate={STILL}"])  # nothing can get better
     assert "the weights of the epoch of best val/open_loop_error" in capsys.readouterr().out
     (checkpoint,) = Path(".envtf").rglob("*.ckpt")
     assert "epoch=0" in checkpoint.name  # of equals the first is best
