@@ -252,7 +252,7 @@ def model_params(name: str, task: str, options: SuiteOptions) -> Params:
         model = replace(train.model, context=1)
         train = replace(train, model=model, batch_size=train.batch_size * options.context)
     elif name == "ensemble":
-        train = replace(train, ensemble=options.ensemble)
+        train = TrainModelOptions(ensemble=options.ensemble)  # one for every budget of the transformer's
     params = replace(Params(), task=task, train_model=train, **_common(options))
     check_ranges(params)
     check_world_model(train)
