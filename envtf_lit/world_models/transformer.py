@@ -23,7 +23,7 @@ from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 from envtf_lit.world_models.recalibration import standardised_residuals, variance_factor
 
 LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -14.0, 4.0
-LARGE_CACHE = 2**18  # numbers; beyond, a CPU takes the cache token by token, since a batch of tiny products is slower
+LARGE_CACHE = 2**18  # numbers; beyond, a CPU takes the cache token by token, whose products then stay in its own caches
 
 
 def rotate(x: Tensor, positions: Tensor) -> Tensor:
@@ -91,13 +91,13 @@ def _scores(q: Tensor, keys: Tensor) -> Tensor:
     """Products (C, B, H) of queries (B, H, d) with keys (C, B, H, d)."""
     if _token_by_token(keys):
         return torch.stack([(q * key).sum(-1) for key in keys.unbind()])
-    return torch.einsum("bhd,cbhd->cbh", q, keys)
+    return (q * keys).sum(-1)
 
 
 def _mixture(weight: Tensor, values: Tensor) -> Tensor:
     """Sums (B, H, d) of values (C, B, H, d), weighted by (C, B, H)."""
     if not _token_by_token(values):
-        return torch.einsum("cbh,cbhd->bhd", weight, values)
+        return (weight.unsqueeze(-1) * values).sum(0)
     first, *others = zip(weight.unsqueeze(-1).unbind(), values.unbind(), strict=True)
     y = first[0] * first[1]
     for share, value in others:
