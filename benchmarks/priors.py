@@ -113,7 +113,6 @@ def main() -> None:
     for weight in given.weights:
         begin = time.perf_counter()
         learner, prior = train(model, windows, weight, torch.Generator().manual_seed(given.seed))
-
         familiar = spread(model, learner, prior, weight, course.familiar)
         for contrast, points in course.strange.items():
             strange = spread(model, learner, prior, weight, points)

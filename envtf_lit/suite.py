@@ -4,7 +4,6 @@ The transformer, the same transformer with a context of one step, and the ensemb
 measured of these three, and models that lie there already, trained with the same settings, are not trained again.
 """
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +19,7 @@ import torch
 from envtf_lit import pipeline
 from envtf_lit.data.behaviour import describe_origin
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.fetch import sha256
 from envtf_lit.data.formats import load_dataset
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.machine import hardware
@@ -211,7 +211,7 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
     params = replace(Params(), task=suite.task, train_model=options, **_common(shared))
     key = {"task": suite.task, "transitions": shared.transitions, "seed": shared.seed}
     key |= {"threads": shared.threads, "precision": shared.precision, "train_model": _plain(asdict(options))}
-    key |= {"dataset": _digest(suite.dataset)}
+    key |= {"dataset": sha256(suite.dataset)}
     suite.folders[name] = home / "models" / name
     train = partial(_train, params, suite.dataset, suite.folders[name], home, progress)
     record = home / "models" / f"{name}.json"
@@ -227,11 +227,6 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
 def _plain(options: dict[str, Any]) -> dict[str, Any]:
     """As JSON has them, with lists for tuples."""
     return json.loads(json.dumps(options))
-
-
-def _digest(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _common(options: SuiteOptions) -> dict[str, Any]:
