@@ -2,8 +2,10 @@
 # Everything that a GPU is worth, in one command of at most 25 minutes: benchmarks/gpu.sh [FOLDER]
 #
 # The most valuable comes first, and each result is kept in FOLDER (default: benchmarks/gpu) as soon as it is there, with
-# device and versions inside; machine.txt holds `envtf doctor`, and a .log lies beside each result. What fails or runs
-# out of time is named at the end; what it had measured by then lies in FOLDER/work.
+# device and versions inside; machine.txt holds `envtf doctor`, and a .log lies beside each result. One such model does
+# not fill a GPU: the robots of all comparisons train and are measured side by side, so that their train_seconds are of
+# a shared machine; speeds are measured before and after, alone. What fails or runs out of time is named at the end;
+# what it had measured by then lies in FOLDER/work.
 #
 #   MINUTES=10 benchmarks/gpu.sh                  less time
 #   QUICK=1 benchmarks/gpu.sh /tmp/try            every part on budgets of seconds, on any machine: a rehearsal
@@ -22,19 +24,24 @@ trap 'keep; rm -rf "$work"' EXIT
 # keep: saves what was measured of each model, in FOLDER/work: of a comparison that ran out of time nothing else is left
 keep() {
   mkdir -p "$out/work"
-  (cd "$work" && find . -name '*.json' -print0 | tar -c --null -T -) | tar -x -C "$out/work"
+  (cd "$work" && find . \( -name '*.json' -o -name curves.csv \) -print0 | tar -c --null -T -) | tar -x -C "$out/work"
+}
+
+# left: seconds until the time is over
+left() {
+  echo $((minutes * 60 - (SECONDS - begin)))
 }
 
 # measure NAME COMMAND…: runs `envtf COMMAND… --out FOLDER/NAME.json` within the time that is left
 measure() {
-  local name=$1 left=$((minutes * 60 - (SECONDS - begin)))
+  local name=$1
   shift
-  if ((left <= 0)); then
+  if (($(left) <= 0)); then
     failed+=("$name (no time left)")
     return
   fi
   echo "$name: envtf $*"
-  if timeout "$left" "${envtf[@]}" "$@" --out "$out/$name.json" >"$out/$name.log" 2>&1; then
+  if timeout "$(left)" "${envtf[@]}" "$@" --out "$out/$name.json" >"$out/$name.log" 2>&1; then
     echo "  $((SECONDS - begin)) s so far: $out/$name.json"
   else
     failed+=("$name (see $out/$name.log)")
@@ -42,33 +49,42 @@ measure() {
   keep
 }
 
-small=(--rounds 5)
-paper=(--rounds 3 --batch 2048)
-suite=(--transitions 200000 --updates 20000)
-robots=()
-horizon=()
-hidden=()
+# aside NAME ROBOTS COMMAND…: the same for each robot alone, in the background; `measure NAME` then finds all of it done
+aside() {
+  local name=$1 robot
+  for robot in $2; do
+    timeout "$(left)" "${envtf[@]}" "${@:3}" --robots "$robot" --out "$work/$name-$robot.json" \
+      >"$out/$name-$robot.log" 2>&1 &
+  done
+}
+
+speed=(bench model --rounds 3 --compile)
+suite=(--quiet --work "$work" --transitions 400000 --updates 12000 --windows 256 --ensemble-updates 40000 --threads 4)
+hidden=(--quiet --work "$work" --transitions 400000 --updates 16000 --windows 128 --ensemble-updates 40000 --threads 4)
+calibrate=(--quiet --work "$work" --transitions 100000 --updates 5000 --windows 256 --ensemble-updates 16000 --threads 4)
+horizon=(--trajectories 300 --online 100)
+robots="hopper halfcheetah walker2d ant"
+changed="halfcheetah walker2d"
+paper=paper small=small
 if [[ -n ${QUICK:-} ]]; then
-  small=(--rounds 1 --batch 64 --preset tiny --threads 1)
-  paper=("${small[@]}")
-  suite=(--transitions 3000 --updates 20 --ensemble-updates 20 --threads 1)
-  robots=(--robots hopper)
+  speed=(bench model --rounds 1 --batch 64 --threads 1)
+  suite=(--quiet --work "$work" --transitions 3000 --updates 20 --ensemble-updates 20 --threads 1)
+  hidden=("${suite[@]}" --unseen 1000)
+  calibrate=("${suite[@]}")
   horizon=(--trajectories 4 --online 2)
-  hidden=(--robots walker2d --unseen 1000)
+  robots=hopper
+  changed=walker2d
+  paper=tiny small=tiny
 fi
 
 "${envtf[@]}" doctor >"$out/machine.txt"
-measure model_paper bench model --preset paper "${paper[@]}"
-measure model_small bench model --preset small "${small[@]}"
-measure model_base bench model --preset base "${small[@]}"
-measure cost bench cost --quiet --work "$work" "${suite[@]}"
-measure calibrate calibrate --quiet --work "$work" "${suite[@]}" "${robots[@]}"
-measure horizon horizon --quiet --work "$work" "${suite[@]}" "${robots[@]}" "${horizon[@]}"
-measure hidden hidden --quiet --work "$work" "${suite[@]}" "${hidden[@]}"
-measure model_small_fp32 bench model --preset small --precision fp32 "${small[@]}"
-
-echo "$((SECONDS - begin)) s in all; results in $out"
-if ((${#failed[@]})); then
-  printf 'not measured: %s\n' "${failed[@]}" >&2
-  exit 1
-fi
+measure model_paper "${speed[@]}" --preset $paper --windows 128
+aside horizon "$robots" horizon "${suite[@]}" "${horizon[@]}"
+aside hidden "$changed" hidden "${hidden[@]}"
+aside calibrate "$robots" calibrate "${calibrate[@]}"
+wait
+measure horizon horizon "${suite[@]}" "${horizon[@]}" --robots $robots
+measure hidden hidden "${hidden[@]}" --robots $changed
+measure calibrate calibrate "${calibrate[@]}" --robots $robots
+measure model_small "${speed[@]}" --preset $small
+measure cost bench cost "${suite[@]}"

@@ -38,12 +38,12 @@ from envtf_lit.suite import (
     flat_settings,
     heading,
     kept,
+    measurable,
     other_folders,
 )
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.world_models.horizon import Scale, forecast, whole_episodes
 from envtf_lit.world_models.interface import WorldModel
-from envtf_lit.world_models.store import load_world_model
 
 CONTRASTS = ("expert", "random_policy", "random_action")  # what is strange to a model of medium data
 LEVELS = (0.05, *(k / 10 for k in range(1, 10)), 0.95)  # at which coverage is drawn
@@ -156,7 +156,7 @@ def measure(
     def one(folder: Path) -> dict[str, Any]:
         place = course()
         begin = time.perf_counter()
-        findings = place.measure(load_world_model(folder).to(place.device))
+        findings = place.measure(measurable(folder, suite.options))
         return asdict(findings) | {"numbers": findings.numbers | {"seconds": round(time.perf_counter() - begin, 1)}}
 
     return {

@@ -26,7 +26,7 @@ STAGES = {
 }
 # written out, since to import what knows them takes a second
 ROBOT_NAMES = ("hopper", "halfcheetah", "walker2d", "ant")
-GLOBAL_OPTIONS = ["task", "seed", "threads", "precision"]
+GLOBAL_OPTIONS = ["task", "seed", "threads", "precision", "compile"]
 LIGHTNING = {
     "model": "Lightning's command line of the world model: fit, validate, test (see `envtf model --help`)",
     "agent": "Lightning's command line of the agents: fit, validate (see `envtf agent --help`)",
@@ -228,6 +228,8 @@ def _add_bench(commands: Any) -> None:
     speed.add_argument("--preset", default="small", help="tiny, small, base or paper; default: small")
     speed.add_argument("--device", metavar="NAME", help="such as cpu; default: the accelerator if there is one")
     speed.add_argument("--precision", choices=["fp32", "bf16"], default="bf16", help="of both sides; default: bf16")
+    speed.add_argument("--compile", action="store_true", help="run all models through torch.compile")
+    speed.add_argument("--windows", type=_positive, metavar="N", help="of a gradient step; default: the preset's")
     speed.add_argument("--batch", type=_positive, default=4_096, metavar="N", help="rollouts at a time; default: 4096")
     speed.add_argument("--horizon", type=_positive, default=5, metavar="N", help="steps of each; default: 5")
     speed.add_argument("--rounds", type=_positive, default=5, metavar="N", help="medians are reported; default: 5")
@@ -246,11 +248,15 @@ def _add_suite(command: argparse.ArgumentParser, *, context: int) -> None:
     command.add_argument("--transitions", type=_natural, default=100_000, metavar="N", help="rows of data; 100,000")
     command.add_argument("--updates", type=_natural, default=6_000, metavar="N", help="of the transformers; 6,000")
     command.add_argument(
+        "--windows", type=_positive, default=32, metavar="N", help="of --context steps per update of theirs; 32"
+    )
+    command.add_argument(
         "--ensemble-updates", type=_positive, default=100_000, metavar="N", help="of the ensemble at most; 100,000"
     )
     command.add_argument("--context", type=_natural, default=context, metavar="N", help=f"steps; default: {context}")
     command.add_argument("--seed", type=_natural, default=0, help="default: 0")
     command.add_argument("--threads", type=_natural, default=os.cpu_count() or 1, help="default: one per core")
+    command.add_argument("--compile", action="store_true", help="run them through torch.compile: pays on a GPU")
     command.add_argument("--quiet", action="store_true", help="no progress bars")
 
 
@@ -447,7 +453,7 @@ def _bench_model(namespace: argparse.Namespace, rest: list[str]) -> None:
 
     from envtf_lit.bench.speed import bench_model
 
-    names = ("preset", "device", "precision", "threads", "batch", "horizon", "rounds", "seed")
+    names = ("preset", "device", "precision", "compile", "threads", "windows", "batch", "horizon", "rounds", "seed")
     Console().print_json(data=bench_model(namespace.out, **{name: getattr(namespace, name) for name in names}))
 
 
@@ -466,7 +472,8 @@ def _suite_options(namespace: argparse.Namespace) -> Any:
     from envtf_lit.params import EnsembleOptions
     from envtf_lit.suite import SuiteOptions
 
-    names, most = ("transitions", "updates", "context", "seed", "threads"), namespace.ensemble_updates
+    names = ("transitions", "updates", "windows", "context", "seed", "threads", "compile")
+    most = namespace.ensemble_updates
     ensemble = EnsembleOptions(updates=most, updates_per_epoch=min(EnsembleOptions().updates_per_epoch, most))
     return SuiteOptions(ensemble=ensemble, **{name: getattr(namespace, name) for name in names})
 

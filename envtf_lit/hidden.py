@@ -13,10 +13,9 @@ from envtf_lit.data.formats import load_dataset, save_dataset
 from envtf_lit.evaluation.recognition import Recognition, recognition, recognition_metrics, stretches
 from envtf_lit.figures.recognition import recognition_curves
 from envtf_lit.storage import pick_device, write_json
-from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite, flat_settings, heading, kept
+from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite, flat_settings, heading, kept, measurable
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.world_models.horizon import Scale
-from envtf_lit.world_models.store import load_world_model
 
 UNSEEN_SEED = 1_000_000  # added to the suite's seed: no draw of its data comes again
 
@@ -99,7 +98,7 @@ def _measure(task: Task, suite: Suite, home: Path, measured: HiddenOptions, prog
     trajectories = stretches(load_dataset(unseen), measured.stretches, seed=suite.options.seed).to(device)
 
     def one(folder: Path) -> dict[str, Any]:
-        return asdict(recognition(load_world_model(folder).to(device), trajectories, scale))
+        return asdict(recognition(measurable(folder, suite.options), trajectories, scale))
 
     return {
         name: Recognition(

@@ -28,12 +28,12 @@ from envtf_lit.suite import (
     flat_settings,
     heading,
     kept,
+    measurable,
     other_folders,
 )
 from envtf_lit.tasks import Task, get_task
 from envtf_lit.training import run_folder
 from envtf_lit.world_models.horizon import THRESHOLDS, Scale, Trajectories, whole_episodes
-from envtf_lit.world_models.store import load_world_model
 
 ONLINE = ("random", "medium", "expert")  # policies of the zoo that drive MuJoCo
 SIZES = (1e-4, 1e-3, 1e-2, 1e-1)  # of disturbances, at which the ceiling is drawn
@@ -160,7 +160,7 @@ class _Course:
     """
 
     def __init__(self, task: Task, suite: Suite, home: Path, measured: HorizonOptions, progress: bool) -> None:
-        self.home, self.dataset = home, suite.dataset
+        self.home, self.dataset, self.options = home, suite.dataset, suite.options
         self.seed, self.start = suite.options.seed, measured.start
         self.device = pick_device()
         self.key = flat_settings(task.tier, suite.options, measured=measured)
@@ -196,9 +196,9 @@ class _Course:
 
     def measure(self, name: str, folder: Path) -> dict[str, Tracking]:
         """A model's results by source of the episodes; the recorded ones with ceilings at its own one-step error."""
-        model = load_world_model(folder).to(self.device)
 
         def work() -> dict[str, Tracking]:
+            model = measurable(folder, self.options)
             found = {source: track(model, episodes, self.scale) for source, episodes in self.trajectories.items()}
             drawn = track_sampled(model, self.trajectories[RECORDED], self.scale, seed=self.seed)
             errors = found[RECORDED].numbers

@@ -53,6 +53,7 @@ def world_model(
     seed: int = 0,
     init_from: str | None = None,
     freeze: list[str] = [],  # noqa: B006 (read alone)
+    compile: bool = False,
 ) -> LitWorldModel:
     """Environment Transformer, or the usual ensemble, trained on windows of a log.
 
@@ -64,8 +65,9 @@ def world_model(
         init_from: a published model folder (as models/world_model) whose weights to start from. Scales are those of the
             new data; projections to and from another robot's dimensions begin anew.
         freeze: parts of the model that stay as they are: embed, blocks, blocks.0, norm, head, …
+        compile: fuses the operations of the training loss by torch.compile, which pays on a GPU.
     """
-    return lit_world_model(observation_dim, action_dim, options, seed, init_from, freeze)
+    return lit_world_model(observation_dim, action_dim, options, seed, init_from, freeze, compile)
 
 
 def agent(

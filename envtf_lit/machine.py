@@ -70,12 +70,12 @@ def synchronise(device: torch.device) -> None:
         torch.accelerator.synchronize(device)
 
 
-def in_turns(actions: dict[str, Callable[[], float]], rounds: int) -> list[dict[str, float]]:
-    """Seconds of each action in each round, all of them in turn, after a round that warms up.
+def in_turns(actions: dict[str, Callable[[], float]], rounds: int, *, warm_up: int = 1) -> list[dict[str, float]]:
+    """Seconds of each action in each round, all of them in turn, after so many rounds that warm up.
 
     Whatever else the machine does then falls on all of them alike.
     """
-    return [{name: action() for name, action in actions.items()} for _ in range(rounds + 1)][1:]
+    return [{name: action() for name, action in actions.items()} for _ in range(warm_up + rounds)][warm_up:]
 
 
 def typical(rounds: list[dict[str, float]], name: str) -> float:

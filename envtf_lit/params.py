@@ -330,6 +330,8 @@ class Params:
         seed: of everything random.
         threads: CPU threads of each stage; part of what makes results equal to the bit.
         precision: of matrix products in training and imagination; losses and optimisers stay in fp32.
+        compile: world models train and imagine through torch.compile, which takes a minute to begin with: pays on a
+            GPU, where launching their many small operations is what takes the time.
         download: the dataset.
         train_model: the world model.
         generate_rollouts: the behaviour clone and its imagined rollouts.
@@ -341,6 +343,7 @@ class Params:
     seed: int = 0
     threads: int = 2
     precision: Precision = "bf16"
+    compile: bool = False
     download: DownloadOptions = field(default_factory=DownloadOptions)
     train_model: TrainModelOptions = field(default_factory=TrainModelOptions)
     generate_rollouts: GenerateRolloutsOptions = field(default_factory=GenerateRolloutsOptions)

@@ -26,7 +26,7 @@ from envtf_lit.machine import hardware
 from envtf_lit.params import DownloadOptions, EnsembleOptions, ModelOptions, Params, Precision, TrainModelOptions
 from envtf_lit.storage import pick_device, read_json, write_json
 from envtf_lit.tasks import Robot, Task, get_task
-from envtf_lit.training import run_folder
+from envtf_lit.training import fused, run_folder
 from envtf_lit.validation import check_ranges, check_world_model
 from envtf_lit.world_models.recalibration import calibration_split
 from envtf_lit.world_models.store import load_world_model
@@ -44,20 +44,24 @@ class SuiteOptions:
     Attributes:
         transitions: rows of the zoo's dataset.
         updates: gradient steps of the transformer and of its ablation, which sees as many steps per update.
+        windows: of `context` steps per update of the transformer.
         context: of the transformer, steps.
         ensemble: the ensemble and its budget; it stops early.
         seed: of data and training.
         threads: CPU threads.
         precision: of matrix products in training.
+        compile: as in `Params`; the models are measured through torch.compile, too.
     """
 
     transitions: int = 100_000
     updates: int = 6_000
+    windows: int = TrainModelOptions().batch_size
     context: int = ModelOptions().context
     ensemble: EnsembleOptions = field(default_factory=EnsembleOptions)
     seed: int = 0
     threads: int = 2
     precision: Precision = "bf16"
+    compile: bool = False
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,7 @@ def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str
         options: of the data and the models.
         measured: dataclasses that say what is measured, under the name that goes before their keys.
     """
-    kept = ("transitions", "updates", "context", "seed", "threads", "precision")
+    kept = ("transitions", "updates", "windows", "context", "seed", "threads", "precision", "compile")
     return {
         "tier": tier,
         **{f"suite.{name}": getattr(options, name) for name in kept},
@@ -135,6 +139,11 @@ def kept(home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path]
     if not place.exists():
         write_json(place, measure())
     return read_json(place)
+
+
+def measurable(folder: Path, options: SuiteOptions) -> Any:
+    """A world model as it is measured: on the accelerator if there is one, through torch.compile if the suite is."""
+    return fused(load_world_model(folder).to(pick_device()), options.compile)
 
 
 def other_folders(others: Mapping[str, str], tasks: Sequence[Task]) -> dict[str, dict[str, Path]]:
@@ -210,13 +219,13 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
     home, shared = suite.dataset.parents[1], suite.options
     params = replace(Params(), task=suite.task, train_model=options, **_common(shared))
     key = {"task": suite.task, "transitions": shared.transitions, "seed": shared.seed}
-    key |= {"threads": shared.threads, "precision": shared.precision, "train_model": _plain(asdict(options))}
-    key |= {"dataset": sha256(suite.dataset)}
+    key |= {"threads": shared.threads, "precision": shared.precision, "compile": shared.compile}
+    key |= {"train_model": _plain(asdict(options)), "dataset": sha256(suite.dataset)}
     suite.folders[name] = home / "models" / name
     train = partial(_train, params, suite.dataset, suite.folders[name], home, progress)
     record = home / "models" / f"{name}.json"
     # an option that is younger than the record had its default when that was written
-    older: dict[str, Any] = {"train_model": _plain(asdict(TrainModelOptions()))}
+    older: dict[str, Any] = {"train_model": _plain(asdict(TrainModelOptions())), "compile": False}
     if record.exists() and record.stat().st_mtime >= suite.dataset.stat().st_mtime:  # trained on what lies there
         older["dataset"] = key["dataset"]
     suite.seconds[name] = _unless_done(record, key, train, older)
@@ -232,7 +241,8 @@ def _plain(options: dict[str, Any]) -> dict[str, Any]:
 def _common(options: SuiteOptions) -> dict[str, Any]:
     """What the stages' parameters take over from the suite's."""
     download = DownloadOptions(transitions=options.transitions)
-    return dict(seed=options.seed, threads=options.threads, precision=options.precision, download=download)
+    shared = {name: getattr(options, name) for name in ("seed", "threads", "precision", "compile")}
+    return shared | {"download": download}
 
 
 def model_params(name: str, task: str, options: SuiteOptions) -> Params:
@@ -241,7 +251,9 @@ def model_params(name: str, task: str, options: SuiteOptions) -> Params:
     Raises:
         UserError: options that are out of range or contradict each other.
     """
-    train = TrainModelOptions(updates=options.updates, updates_per_epoch=min(1_000, options.updates))
+    train = TrainModelOptions(
+        updates=options.updates, updates_per_epoch=min(1_000, options.updates), batch_size=options.windows
+    )
     train = replace(train, model=replace(train.model, context=options.context))
     if name == "context_1":  # windows of one step, as many steps per update
         model = replace(train.model, context=1)

@@ -139,7 +139,8 @@ class OfflineAgent(L.LightningModule, ABC):
 
     def on_train_epoch_start(self) -> None:
         self.clones = not bool(self.started)
-        self.generator = epoch_generator(self.seed, self.current_epoch, f"agent{self.global_rank or ''}")
+        stream = f"agent{self.global_rank or ''}"
+        self.generator = epoch_generator(self.seed, self.current_epoch, stream, self.device)
         self.update_index = self.current_epoch * self.options.updates_per_epoch
         self.logged: dict[str, list[Tensor]] = {}
         if self.value_gradient is not None:  # each epoch depends on its own seed alone: a run can resume there

@@ -91,7 +91,7 @@ def _trial(name: str, task: str, dataset: Path, root: Path, options: SuiteOption
     if name == "mlp":
         train = _plain(train, robot.observation_dim, robot.action_dim)
     data, clock, budget = window_data(str(dataset), train, seed=options.seed), Clock(), train.ensemble or train
-    lit = lit_world_model(robot.observation_dim, robot.action_dim, train, options.seed)
+    lit = lit_world_model(robot.observation_dim, robot.action_dim, train, options.seed, compile=options.compile)
     key = {"trial": time.time_ns(), "options": asdict(train)}  # never continued: its seconds would not be known
     fit(
         lit,

@@ -7,6 +7,7 @@ they do not change the work.
 import multiprocessing
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from multiprocessing.pool import Pool
 from pathlib import Path
 from statistics import fmean
@@ -22,7 +23,7 @@ from envtf_lit.params import GenerateRolloutsOptions, Precision, TrainModelOptio
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.storage import write_json
 from envtf_lit.tasks import ROBOTS, Robot, never_terminated
-from envtf_lit.training import autocast
+from envtf_lit.training import autocast, fused
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.lit import LitWorldModel
@@ -42,12 +43,14 @@ def bench_model(
     robot: str = "hopper",
     device: str | None = None,
     precision: Precision = "bf16",
+    compile: bool = False,
     threads: int = 1,
     batch: int = 4_096,
     horizon: int = 5,
     rounds: int = 5,
     real_steps: int = 2_000,
     updates: int = 20,
+    windows: int | None = None,
     seed: int = 0,
 ) -> dict[str, Any]:
     """Measures imagination and training of a preset's world model.
@@ -58,12 +61,14 @@ def bench_model(
         robot: gives the dimensions, and the simulator.
         device: such as `cpu`; None takes the accelerator if there is one.
         precision: of matrix products, on both sides of each ratio.
+        compile: all models run through torch.compile.
         threads: of the CPU, and processes of the simulator.
         batch: rollouts at a time.
         horizon: steps of each.
         rounds: in which all sides take turns; medians are reported.
         real_steps: of the simulator, per process and round.
         updates: gradient steps per round.
+        windows: of a gradient step; None takes the preset's.
         seed: of weights and states.
 
     Returns:
@@ -73,13 +78,17 @@ def bench_model(
         UserError: an unknown preset or device.
     """
     place, options, body = bench_device(device), preset_params(preset).train_model, ROBOTS[robot]
+    options = replace(options, batch_size=windows or options.batch_size)
+    warm_up = 3 if compile else 1  # what is compiled is compiled again for other shapes, and recorded at its second run
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     with torch.no_grad(), autocast(place, precision), _simulators(body, threads) as simulators:
-        actions = _imagination(body, options, place, batch, horizon) | _cache(body, options, place, batch)
-        timings = in_turns(actions | {"real": lambda: _real(simulators, threads, real_steps)}, rounds)
-    train, flops = _training(body, options, place, precision, updates)
-    learning = in_turns({"train": train, "matmul": _matmul(place, precision)}, rounds)
+        actions = _imagination(body, options, place, batch, horizon, compile)
+        actions |= _cache(body, options, place, batch, compile)
+        actions |= {"real": lambda: _real(simulators, threads, real_steps)}
+        timings = in_turns(actions, rounds, warm_up=warm_up)
+    train, flops = _training(body, options, place, precision, updates, compile)
+    learning = in_turns({"train": train, "matmul": _matmul(place, precision)}, rounds, warm_up=warm_up)
     steps, tokens = batch * horizon, updates * options.batch_size * options.model.context
     size, repeats = _matmul_size(place)
     result: dict[str, Any] = {
@@ -100,6 +109,8 @@ def bench_model(
         "batch": batch,
         "horizon": horizon,
         "context": options.model.context,
+        "windows": options.batch_size,
+        "compile": compile,
         "seed": seed,
         **facts(place, precision),
     }
@@ -109,12 +120,12 @@ def bench_model(
 
 
 def _imagination(
-    robot: Robot, options: TrainModelOptions, device: torch.device, batch: int, horizon: int
+    robot: Robot, options: TrainModelOptions, device: torch.device, batch: int, horizon: int, compile: bool
 ) -> dict[str, Callable[[], float]]:
     """Rollouts from single states by both models, and, with the transformer's cache full, their steps alone."""
     S, A, context = robot.observation_dim, robot.action_dim, options.model.context
-    transformer = _frozen(EnvironmentTransformer(S, A, **vars(options.model)), device)
-    ensemble = _frozen(EnsembleDynamics(S, A), device)
+    transformer = _frozen(EnvironmentTransformer(S, A, **vars(options.model)), device, compile)
+    ensemble = _frozen(EnsembleDynamics(S, A), device, compile)
     actor = TanhGaussianActor(S, A).to(device)
     single, past = _histories(robot, batch, 1, device), _histories(robot, batch, context, device)
 
@@ -148,11 +159,12 @@ def _steps(
 
 
 def _cache(
-    robot: Robot, options: TrainModelOptions, device: torch.device, batch: int
+    robot: Robot, options: TrainModelOptions, device: torch.device, batch: int, compile: bool
 ) -> dict[str, Callable[[], float]]:
     """One step of all rollouts where the window is full: with the cache, and by a pass over the whole window."""
     wide = vars(options.model) | {"context": UNCACHED_CONTEXT}
-    model = _frozen(EnvironmentTransformer(robot.observation_dim, robot.action_dim, **wide), device)
+    model = _frozen(EnvironmentTransformer(robot.observation_dim, robot.action_dim, **wide), device, compile)
+    encode = torch.compile(model.encode) if compile else model.encode
     observations, actions, lengths = _histories(robot, batch, UNCACHED_CONTEXT, device)
     state, action = model.init(observations, actions, lengths), torch.randn(batch, robot.action_dim, device=device)
     windows = observations.split(CHUNK), torch.cat([actions, action[:, None]], 1).split(CHUNK)
@@ -164,7 +176,7 @@ def _cache(
 
     def uncached() -> None:
         for past, done in zip(*windows, strict=True):
-            hidden, _ = model.encode(past, done, cached=False)
+            hidden, _ = encode(past, done, cached=False)
             model.predict(hidden[:, -1], past[:, -1])
 
     return {"cached": lambda: seconds(cached, device), "uncached": lambda: seconds(uncached, device)}
@@ -185,18 +197,23 @@ def _shared_histories(robot: Robot, batch: int, length: int, device: torch.devic
     return observations, actions, length + branch % SHARE, branch // SHARE
 
 
-def _frozen(model: Any, device: torch.device) -> Any:
-    return model.to(device).eval().requires_grad_(False)
+def _frozen(model: Any, device: torch.device, compile: bool) -> Any:
+    return fused(model.to(device).eval().requires_grad_(False), compile)
 
 
 def _training(
-    robot: Robot, options: TrainModelOptions, device: torch.device, precision: Precision, updates: int
+    robot: Robot,
+    options: TrainModelOptions,
+    device: torch.device,
+    precision: Precision,
+    updates: int,
+    compile: bool,
 ) -> tuple[Callable[[], float], int]:
     """Gradient steps as the pipeline takes them, loading apart, and the floating-point operations of a token in them.
 
     Those are 6 for each weight of a matrix: 2 forward, 4 backward. Attention's own products are left out.
     """
-    module = LitWorldModel(robot.observation_dim, robot.action_dim, options).to(device)
+    module = LitWorldModel(robot.observation_dim, robot.action_dim, options, compile=compile).to(device)
     optimizer = module.configure_optimizers()["optimizer"]
     shape = options.batch_size, options.model.context
     batch = {
@@ -211,7 +228,7 @@ def _training(
         for _ in range(updates):
             optimizer.zero_grad()
             with autocast(device, precision):
-                loss = module.model.loss(batch)
+                loss = module.loss(batch)
             loss.backward()
             nn.utils.clip_grad_norm_(module.model.parameters(), options.gradient_clip)
             optimizer.step()

@@ -19,10 +19,10 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.formats import load_dataset
 
 
-def epoch_generator(seed: int, epoch: int, stream: str) -> torch.Generator:
-    """An independent random stream for each (seed, epoch, purpose)."""
+def epoch_generator(seed: int, epoch: int, stream: str, device: torch.device | str = "cpu") -> torch.Generator:
+    """An independent random stream for each (seed, epoch, purpose), of numbers drawn on that device."""
     words = np.random.SeedSequence([seed, epoch, *stream.encode()]).generate_state(2, np.uint32)
-    return torch.Generator().manual_seed(int(words[0]) << 32 | int(words[1]))
+    return torch.Generator(device).manual_seed(int(words[0]) << 32 | int(words[1]))
 
 
 class WeightedRows:

@@ -33,11 +33,12 @@ def lit_world_model(
     seed: int = 0,
     init_from: str | None = None,
     freeze: Sequence[str] = (),
+    compile: bool = False,
 ) -> "LitWorldModel":
     """The module that trains what the options name: the ensemble if they have a section for it, or the transformer."""
     options = options or TrainModelOptions()
     kind = LitWorldModel if options.ensemble is None else LitEnsemble
-    return kind(observation_dim, action_dim, options, seed, init_from, freeze)
+    return kind(observation_dim, action_dim, options, seed, init_from, freeze, compile)
 
 
 def window_data(path: str, options: TrainModelOptions, *, seed: int) -> WindowData:
@@ -69,6 +70,7 @@ class LitWorldModel(L.LightningModule):
         seed: of dropout and of sampled objectives.
         init_from: a published model folder whose weights to start from; see `start_from` of the models.
         freeze: parts of the model that stay as they are, such as `blocks`.
+        compile: fuses the operations of the training loss, which pays on a GPU.
     """
 
     monitor: str | None = "val/open_loop_error"
@@ -81,6 +83,7 @@ class LitWorldModel(L.LightningModule):
         seed: int = 0,
         init_from: str | None = None,
         freeze: Sequence[str] = (),
+        compile: bool = False,
     ) -> None:
         super().__init__()
         self.options = _train_options(options)
@@ -96,6 +99,8 @@ class LitWorldModel(L.LightningModule):
         self.seed, self.init_from = seed, init_from
         self.model: Any = self._build(observation_dim, action_dim)
         training.freeze(self.model, freeze)
+        # "reduce-overhead" replays the kernels of all batches of a shape as one recorded graph
+        self.loss = torch.compile(self.model.loss, mode="reduce-overhead") if compile else self.model.loss
 
     def _build(self, observation_dim: int, action_dim: int) -> EnvironmentTransformer | EnsembleDynamics:
         return EnvironmentTransformer(observation_dim, action_dim, **asdict(self.options.model))
@@ -139,7 +144,7 @@ class LitWorldModel(L.LightningModule):
         torch.manual_seed(epoch_generator(self.seed, self.current_epoch, stream).initial_seed())
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
-        loss = self.model.loss(batch) * self._share(batch["mask"])
+        loss = self.loss(batch) * self._share(batch["mask"])
         self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch["mask"]), sync_dist=True)
         return loss
 
@@ -174,6 +179,7 @@ class LitWorldModel(L.LightningModule):
             [dict(params=matrices, weight_decay=o.weight_decay), dict(params=vectors, weight_decay=0.0)],
             lr=o.learning_rate,
             eps=o.eps,
+            fused=self.device.type != "cpu",  # one pass over all weights
         )
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate)
         return dict(optimizer=optimizer, lr_scheduler=dict(scheduler=schedule, interval="step"))
@@ -203,8 +209,9 @@ class LitEnsemble(LitWorldModel):
         seed: int = 0,
         init_from: str | None = None,
         freeze: Sequence[str] = (),
+        compile: bool = False,
     ) -> None:
-        super().__init__(observation_dim, action_dim, options, seed, init_from, freeze)
+        super().__init__(observation_dim, action_dim, options, seed, init_from, freeze, compile)
         self.best = copy.deepcopy(self.model).requires_grad_(False)  # a module, so that checkpoints hold it
         self.register_buffer("best_error", torch.full((self.ensemble.members,), torch.inf))
         self.register_buffer("stale", torch.zeros((), dtype=torch.int64))  # epochs since a member improved
@@ -245,7 +252,7 @@ class LitEnsemble(LitWorldModel):
             self.trainer.should_stop = True
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
-        loss = self.model.loss(batch)
+        loss = self.loss(batch)
         self.log("train/loss", loss / self.ensemble.members, on_step=False, on_epoch=True, batch_size=1)
         return loss + self.model.decay(self.ensemble.weight_decay)
 

@@ -74,13 +74,19 @@ class Attention(nn.Module):
 
     def recall(self, q: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
         """One token's queries (B, H, d) over cached keys and values (C, B, H, d); `mask` is (C, B, 1)."""
-        with torch.autocast(q.device.type, enabled=False):  # or the fp32 cache would be cast, whole, at every step
+        with torch.autocast(q.device.type, enabled=False):  # or a cache in fp32 would be cast, whole, at every step
             score = _scores(q.float(), keys) * q.shape[-1] ** -0.5  # (C, B, H)
             if mask is not None:
                 score = score.masked_fill(~mask, float("-inf"))
             weight = F.dropout(score.softmax(0), self.dropout, self.training)
             y = _mixture(weight, values)
         return self.out(y.flatten(1))  # (B, D)
+
+
+def _cache_type(device: torch.device) -> torch.dtype:
+    """As matrix products give keys and values on an accelerator, whose memory full caches fill; elsewhere fp32."""
+    kept_short = device.type != "cpu" and torch.is_autocast_enabled(device.type)
+    return torch.get_autocast_dtype(device.type) if kept_short else torch.float32
 
 
 def _token_by_token(cache: Tensor) -> bool:
@@ -130,8 +136,8 @@ class TransformerState:
     """A batch of rollouts under way: the ring cache, the clock, and the state that has no action yet.
 
     Attributes:
-        cache: per layer, keys and values (context, B, H, d); token t lies in slot t mod context, and slots that have
-            held none hold nothing.
+        cache: per layer, keys and values (context, B, H, d), in `_cache_type`; token t lies in slot t mod context, and
+            slots that have held none hold nothing.
         clock: position of the next token, the same for all rows (histories are right-aligned).
         first: (B,) position of each row's first token, or None where all rows began at 0.
         observation: (B, S) current observation.
@@ -375,11 +381,10 @@ class EnvironmentTransformer(nn.Module):
         B, longest = len(lengths), observations.shape[1] - 1  # rollouts, and tokens of a history
         window = torch.arange(B, device=lengths.device) if window is None else window
         current = observations[window, lengths - 1]
-        clock = min(
-            longest, self.options.context - 1
-        )  # the token before the current state gets the same position in all
+        clock = min(longest, self.options.context - 1)  # all rows' tokens before the current states lie in one slot
         size = (self.options.context, B, self.options.heads, self.options.width // self.options.heads)
-        cache = [(current.new_empty(size), current.new_empty(size)) for _ in self.blocks]
+        kind = _cache_type(current.device)
+        cache = [(current.new_empty(size, dtype=kind), current.new_empty(size, dtype=kind)) for _ in self.blocks]
         first = None
         if clock > 0:
             shift = clock - (lengths - 1)  # (B,) from a token's position in the window to that in the cache
@@ -387,8 +392,8 @@ class EnvironmentTransformer(nn.Module):
             first = shift.clamp(min=0) if bool((shift > 0).any()) else None
             _, tokens = self.encode(observations[:, :-1], actions, cached=True)
             for (keys, values), (k, v) in zip(cache, tokens, strict=True):
-                k, v = (x.transpose(1, 2)[window, index.clamp(min=0)].float() for x in (k, v))  # (clock, B, H, d)
-                keys[:clock], values[:clock] = rotate(k, shift[:, None]), v
+                k, v = (x.transpose(1, 2)[window, index.clamp(min=0)] for x in (k, v))  # (clock, B, H, d)
+                keys[:clock], values[:clock] = rotate(k.float(), shift[:, None]), v
         drawn = posterior * self._posterior().draw(B, generator) if posterior > 0 else None
         return TransformerState(cache, clock, first, current, drawn)
 
