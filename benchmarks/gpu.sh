@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Everything that a GPU is worth, in one command of at most 25 minutes: benchmarks/gpu.sh [FOLDER]
 #
-# The most valuable comes first, and each result is kept in FOLDER (default: benchmarks/gpu) as soon as it is there, with
-# device and versions inside; machine.txt holds `envtf doctor`, and a .log lies beside each result. One such model does
+# The most valuable comes first, and each result is kept in FOLDER (default: benchmarks/gpu) as soon as it is there,
+# with device and versions inside; machine.txt holds `envtf doctor`, and a .log lies beside each result. One such model does
 # not fill a GPU: the robots of all comparisons train and are measured side by side, so that their train_seconds are of
 # a shared machine; speeds are measured before and after, alone. What fails or runs out of time is named at the end;
 # what it had measured by then lies in FOLDER/work.
@@ -49,7 +49,7 @@ measure() {
   keep
 }
 
-# aside NAME ROBOTS COMMAND…: the same for each robot alone, in the background; `measure NAME` then finds all of it done
+# aside NAME ROBOTS COMMAND…: the same for each robot alone, in the background; `measure NAME` then finds it all done
 aside() {
   local name=$1 robot
   for robot in $2; do
@@ -59,9 +59,10 @@ aside() {
 }
 
 speed=(bench model --rounds 3 --compile)
-suite=(--quiet --work "$work" --transitions 400000 --updates 12000 --windows 256 --ensemble-updates 40000 --threads 4)
-hidden=(--quiet --work "$work" --transitions 400000 --updates 16000 --windows 128 --ensemble-updates 40000 --threads 4)
-calibrate=(--quiet --work "$work" --transitions 100000 --updates 5000 --windows 256 --ensemble-updates 16000 --threads 4)
+suite=(--quiet --compile --work "$work" --threads 4 --windows 256)
+hidden=("${suite[@]}" --windows 128 --transitions 400000 --updates 16000 --ensemble-updates 40000)
+calibrate=("${suite[@]}" --updates 5000 --ensemble-updates 16000)
+suite+=(--transitions 400000 --updates 12000 --ensemble-updates 40000)
 horizon=(--trajectories 300 --online 100)
 robots="hopper halfcheetah walker2d ant"
 changed="halfcheetah walker2d"
