@@ -60,9 +60,9 @@ aside() {
 
 speed=(bench model --rounds 3 --compile)
 suite=(--quiet --compile --work "$work" --threads 4 --windows 256)
-hidden=("${suite[@]}" --windows 128 --transitions 400000 --updates 16000 --ensemble-updates 40000)
-calibrate=("${suite[@]}" --updates 5000 --ensemble-updates 16000)
-suite+=(--transitions 400000 --updates 12000 --ensemble-updates 40000)
+hidden=("${suite[@]}" --windows 128 --transitions 200000 --updates 12000 --ensemble-updates 24000)
+calibrate=("${suite[@]}" --updates 5000 --ensemble-updates 12000)
+suite+=(--transitions 400000 --updates 10000 --ensemble-updates 24000)
 horizon=(--trajectories 300 --online 100)
 robots="hopper halfcheetah walker2d ant"
 changed="halfcheetah walker2d"
@@ -82,10 +82,11 @@ fi
 measure model_paper "${speed[@]}" --preset $paper --windows 128
 aside horizon "$robots" horizon "${suite[@]}" "${horizon[@]}"
 aside hidden "$changed" hidden "${hidden[@]}"
-aside calibrate "$robots" calibrate "${calibrate[@]}"
 wait
 measure horizon horizon "${suite[@]}" "${horizon[@]}" --robots $robots
 measure hidden hidden "${hidden[@]}" --robots $changed
+aside calibrate "$robots" calibrate "${calibrate[@]}"
+wait
 measure calibrate calibrate "${calibrate[@]}" --robots $robots
 measure model_small "${speed[@]}" --preset $small
 measure cost bench cost "${suite[@]}"

@@ -132,7 +132,7 @@ def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool 
     from envtf_lit.data.formats import load_dataset
     from envtf_lit.imagination import BranchPoints, NoisyPolicy, imagine, save_rollouts
     from envtf_lit.policy import save_policy
-    from envtf_lit.training import autocast, fused, run_folder
+    from envtf_lit.training import autocast, run_folder
     from envtf_lit.world_models.store import load_world_model
 
     options = params.generate_rollouts
@@ -153,7 +153,7 @@ def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool 
             save_policy(folder, clone)
             curves.write(folder / CURVES)
         device = pick_device()
-        model = fused(load_world_model(root / WORLD_MODEL).to(device), params.compile)
+        model = load_world_model(root / WORLD_MODEL, fused=params.compile).to(device)
         generator = torch.Generator(device).manual_seed(params.seed)
         points = BranchPoints(dataset, device)
         starts = points.draw_shared(options.branches, options.history, options.share, generator)
@@ -334,11 +334,10 @@ def _give_imagination(agent: Any, params: Params, root: Path, dataset: Any) -> N
     """Hands an agent the world model and the stored rollouts."""
     from envtf_lit.data.loaders import return_weights
     from envtf_lit.imagination import Imagination, load_rollouts
-    from envtf_lit.training import fused
     from envtf_lit.world_models.store import load_world_model
 
     device = pick_device()
-    model = fused(load_world_model(root / WORLD_MODEL).to(device), params.compile)
+    model = load_world_model(root / WORLD_MODEL, fused=params.compile).to(device)
     temperature = agent.options.return_temperature
     weights = None if temperature is None else return_weights(dataset, temperature)  # as the real rows are drawn
     imagination = Imagination(

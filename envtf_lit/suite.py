@@ -26,7 +26,7 @@ from envtf_lit.machine import hardware
 from envtf_lit.params import DownloadOptions, EnsembleOptions, ModelOptions, Params, Precision, TrainModelOptions
 from envtf_lit.storage import pick_device, read_json, write_json
 from envtf_lit.tasks import Robot, Task, get_task
-from envtf_lit.training import fused, run_folder
+from envtf_lit.training import run_folder
 from envtf_lit.validation import check_ranges, check_world_model
 from envtf_lit.world_models.recalibration import calibration_split
 from envtf_lit.world_models.store import load_world_model
@@ -143,7 +143,7 @@ def kept(home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path]
 
 def measurable(folder: Path, options: SuiteOptions) -> Any:
     """A world model as it is measured: on the accelerator if there is one, through torch.compile if the suite is."""
-    return fused(load_world_model(folder).to(pick_device()), options.compile)
+    return load_world_model(folder, fused=options.compile).to(pick_device())
 
 
 def other_folders(others: Mapping[str, str], tasks: Sequence[Task]) -> dict[str, dict[str, Path]]:

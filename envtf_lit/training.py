@@ -149,13 +149,6 @@ def freeze(module: nn.Module, parts: Sequence[str]) -> None:
         raise UserError(f"Freezing {', '.join(parts)} leaves nothing to train: freeze less.")
 
 
-def fused(model: Any, compile: bool) -> Any:
-    """A world model whose step runs through torch.compile if asked to: the same numbers up to rounding."""
-    if compile:
-        model.step = torch.compile(model.step, dynamic=True)  # clock and rows change as rollouts go on
-    return model
-
-
 def autocast(device: torch.device, precision: Precision) -> torch.autocast:
     """bf16 matrix products where the parameters ask for them."""
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")

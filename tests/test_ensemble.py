@@ -3,6 +3,7 @@
 import csv
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -306,3 +307,17 @@ def test_members_are_kept_at_their_best_and_the_best_are_elites():
     ]
     lit._keep_the_best(torch.tensor([0.4, 0.1, 0.2]))
     assert int(lit.stale) == 1
+
+
+def test_fused_steps_equal_plain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    through_dynamo = partial(torch.compile, backend="eager")
+    plain, fused = make_ensemble(), make_ensemble()
+    monkeypatch.setattr(torch, "compile", through_dynamo)
+    fused.fuse()
+    for rows in (5, 3):
+        states = [start(model, rows) for model in (plain, fused)]
+        for step in range(3):
+            for number, model in enumerate((plain, fused)):
+                torch.manual_seed(step)
+                states[number], _ = model.step(states[number], torch.randn(rows, A), mode="sample")
+            torch.testing.assert_close(states[1].observation, states[0].observation)

@@ -145,6 +145,23 @@ def test_a_killed_policy_run_resumes_to_the_same_bits(root, monkeypatch, algorit
     assert bytes_of(root / "models/policy" / algorithm) == expected
 
 
+def test_compiled_training_learns_what_plain_training_learns(root, monkeypatch):
+    weights, compiled, original = [], [], torch.compile
+
+    def through_dynamo(function, **options):
+        compiled.append(function)
+        return original(function, backend="eager")
+
+    monkeypatch.setattr(torch, "compile", through_dynamo)
+    options = replace(TINY.train_model, model=replace(TINY.train_model.model, dropout=0.0))
+    for compile in (False, True):
+        params = replace(TINY, precision="fp32", compile=compile, train_model=options)
+        pipeline.train_model(params, root, progress=False)
+        weights.append(load_world_model(root / pipeline.WORLD_MODEL).state_dict())
+    assert len(compiled) == 1
+    torch.testing.assert_close(weights[1], weights[0])
+
+
 def test_gradient_steps_are_those_asked_for(root):
     pipeline.train_policy(TINY, root, algorithm="cql", progress=False)
     with (root / "models/policy/cql/curves.csv").open() as stream:

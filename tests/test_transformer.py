@@ -1,6 +1,7 @@
 """The Environment Transformer: causality, the ring cache, objectives, fidelity to the paper's form."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -406,6 +407,26 @@ def test_multi_step_learns_from_its_own_predictions_with_gradients_through_them(
     (gradient,) = torch.autograd.grad(model.loss(batch), model.head.bias)
     assert not torch.allclose(gradient, (through + apart) / 2)  # some of it came through the predictions
     assert model.eval().loss(batch) == one.eval().loss(batch)
+
+
+def test_fused_steps_equal_plain_ones(monkeypatch: pytest.MonkeyPatch):
+    through_dynamo = partial(
+        torch.compile, backend="eager"
+    )  # what inductor then makes of the graphs is its own business
+    plain, fused = (make_model().requires_grad_(False) for _ in range(2))
+    monkeypatch.setattr(torch, "compile", through_dynamo)
+    fused.fuse()
+    observations, actions = sequences(5, 4)
+    lengths = torch.tensor([1, 2, 4, 4, 3])
+    states = [model.init(observations, actions[:, :-1], lengths) for model in (plain, fused)]
+    for step in range(9):  # past the context
+        for number, model in enumerate((plain, fused)):
+            torch.manual_seed(step)
+            action = torch.randn(len(states[number].observation), A)
+            states[number], _ = model.step(states[number], action, mode="sample")
+            if step == 4:  # rollouts end, and fewer go on
+                states[number] = model.gather(states[number], torch.tensor([0, 3]))
+        torch.testing.assert_close(states[1].observation, states[0].observation)
 
 
 def test_any_step_hides_states_behind_the_last_one_shown():

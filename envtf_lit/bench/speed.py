@@ -23,7 +23,7 @@ from envtf_lit.params import GenerateRolloutsOptions, Precision, TrainModelOptio
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.storage import write_json
 from envtf_lit.tasks import ROBOTS, Robot, never_terminated
-from envtf_lit.training import autocast, fused
+from envtf_lit.training import autocast
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.lit import LitWorldModel
@@ -198,7 +198,9 @@ def _shared_histories(robot: Robot, batch: int, length: int, device: torch.devic
 
 
 def _frozen(model: Any, device: torch.device, compile: bool) -> Any:
-    return fused(model.to(device).eval().requires_grad_(False), compile)
+    if compile:
+        model.fuse()
+    return model.to(device).eval().requires_grad_(False)
 
 
 def _training(

@@ -189,7 +189,7 @@ class EnsembleDynamics(nn.Module):
         return EnsembleState(current, self._draw(B, generator), posterior)
 
     def _draw(self, count: int, generator: torch.Generator | None) -> Tensor:
-        return torch.randint(len(self.elite), (count,), generator=generator, device=self.elite.device)
+        return self.elite.new_empty(count).random_(len(self.elite), generator=generator)
 
     def step(
         self, state: EnsembleState, action: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None
@@ -224,7 +224,7 @@ class EnsembleDynamics(nn.Module):
         generator: torch.Generator | None,
     ) -> Tensor:
         """The outcome (B, S + 1) in unit scale: the mean or a draw, of the mixture or of each row's own elite."""
-        _, B, D = means.shape
+        B = means.shape[1]
         drawn, value = state.drawn, means.mean(0)
         if drawn is None and mode == "sample":
             drawn = self._draw(B, generator)
@@ -234,9 +234,13 @@ class EnsembleDynamics(nn.Module):
         own = means[drawn, rows]
         value = own if state.drawn is None else value + state.posterior * (own - value)
         if mode == "sample":
-            noise = torch.randn((B, D), generator=generator, device=value.device, dtype=value.dtype)
+            noise = torch.empty_like(value).normal_(generator=generator)
             value = value + torch.exp(0.5 * log_variances[drawn, rows]) * noise
         return value
+
+    def fuse(self) -> None:
+        """See `WorldModel.fuse`."""
+        self.step = torch.compile(self.step, dynamic=True)  # the number of rows changes
 
     def observe(self, state: EnsembleState, observation: Tensor) -> EnsembleState:
         """See `WorldModel.observe`."""

@@ -179,7 +179,6 @@ class LitWorldModel(L.LightningModule):
             [dict(params=matrices, weight_decay=o.weight_decay), dict(params=vectors, weight_decay=0.0)],
             lr=o.learning_rate,
             eps=o.eps,
-            fused=self.device.type != "cpu",  # one pass over all weights
         )
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate)
         return dict(optimizer=optimizer, lr_scheduler=dict(scheduler=schedule, interval="step"))

@@ -21,10 +21,17 @@ def save_world_model(folder: str | Path, model: EnvironmentTransformer | Ensembl
     save_module(folder, model, kind=kind, arguments=model.arguments)
 
 
-def load_world_model(folder: str | Path) -> Any:
+def load_world_model(folder: str | Path, *, fused: bool = False) -> Any:
     """The world model saved in a folder, in eval mode; it follows `WorldModel`.
+
+    Args:
+        folder: as `save_world_model` wrote it.
+        fused: compile its steps, see `WorldModel.fuse`.
 
     Raises:
         UserError: the folder is missing, damaged, or holds something that is not a world model.
     """
-    return load_module(folder, WORLD_MODELS).requires_grad_(False)
+    model = load_module(folder, WORLD_MODELS).requires_grad_(False)
+    if fused:
+        model.fuse()
+    return model

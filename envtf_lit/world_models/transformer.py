@@ -125,6 +125,17 @@ class Block(nn.Module):
         )
         self.dropout = nn.Dropout(options.dropout)
 
+    def advance(
+        self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None, clock: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The next token (B, D) of all rows, given the cache that it is written to; its output, and the cache."""
+        context = keys.shape[0]
+        position = torch.full((1,), clock, device=x.device)
+        q, k, v = self.attention.project(self.attention_norm(x)[:, None], position)
+        slot, filled = clock % context, min(clock + 1, context)
+        keys, values = _write(keys, k[:, :, 0], slot), _write(values, v[:, :, 0], slot)
+        return self.finish(x, self.attention.recall(q[:, :, 0], keys[:filled], values[:filled], mask)), keys, values
+
     def finish(self, x: Tensor, attended: Tensor) -> Tensor:
         """The residual sums of both branches, given what attention returned."""
         x = x + self.dropout(attended)
@@ -414,18 +425,20 @@ class EnvironmentTransformer(nn.Module):
         generator: torch.Generator | None = None,
     ) -> tuple[TransformerState, Prediction]:
         """See `WorldModel.step`. One token per call; the cache is written in place unless gradients are needed."""
-        position = torch.tensor([state.clock], device=action.device)
         x = self.embed(self.normaliser.token(state.observation, action))  # (B, D)
-        slot, filled = state.clock % self.options.context, min(state.clock + 1, self.options.context)
-        mask = self._visible(state, filled)
+        mask = self._visible(state, min(state.clock + 1, self.options.context))
         cache = []
         for block, (keys, values) in zip(self._stack(), state.cache, strict=True):
-            q, k, v = block.attention.project(block.attention_norm(x)[:, None], position)
-            keys, values = _write(keys, k[:, :, 0], slot), _write(values, v[:, :, 0], slot)
+            x, keys, values = block.advance(x, keys, values, mask, state.clock)
             cache.append((keys, values))
-            x = block.finish(x, block.attention.recall(q[:, :, 0], keys[:filled], values[:filled], mask))
         prediction = self.predict(self.norm(x), state.observation, state.drawn, mode=mode, generator=generator)
         return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
+
+    def fuse(self) -> None:
+        """See `WorldModel.fuse`. Blocks are compiled one by one: they are alike, so that one serves all."""
+        for block in self._stack():
+            block.advance = torch.compile(block.advance, dynamic=True)  # the clock and the number of rows change
+        self.predict = torch.compile(self.predict, dynamic=True)
 
     def _visible(self, state: TransformerState, filled: int) -> Tensor | None:
         """(C, B, 1), which of the filled slots hold a token of the row itself; None where all do."""
@@ -464,8 +477,7 @@ class EnvironmentTransformer(nn.Module):
             deviation = self._posterior().deviation(hidden.float(), drawn)
             value, spread = mean + deviation * self.recalibration.sqrt(), aleatoric
         if mode == "sample":
-            noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
-            value = value + spread.sqrt() * noise
+            value = value + spread.sqrt() * torch.empty_like(mean).normal_(generator=generator)
         outcome = self.normaliser.outcome(observation, value)
         return Prediction(
             observation=outcome[..., :-1],
