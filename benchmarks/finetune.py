@@ -19,6 +19,8 @@ import pandas as pd
 from envtf_lit.cli import main as envtf
 from envtf_lit.data.behaviour import collect
 from envtf_lit.data.formats import save_dataset
+from envtf_lit.machine import facts
+from envtf_lit.storage import pick_device
 from envtf_lit.tasks import get_task
 
 BASE, TARGET = "hopper-medium-replay", "hopper-medium-replay-hidden"
@@ -98,6 +100,7 @@ def main() -> None:
         "scratch_curve": {int(update): float(error) for update, error in scratch.items()},
         "tuned_curve": {int(update): float(error) for update, error in tuned.items()},
         **{name: value for name, value in vars(options).items() if name not in ("out", "work")},
+        **facts(pick_device(), "bf16"),
     }
     text = json.dumps(result, indent=2) + "\n"
     sys.stdout.write(text)
