@@ -62,7 +62,7 @@ speed=(bench model --rounds 3 --compile)
 suite=(--quiet --compile --work "$work" --threads 4 --windows 256)
 hidden=("${suite[@]}" --windows 128 --transitions 200000 --updates 12000 --ensemble-updates 24000)
 calibrate=("${suite[@]}" --updates 5000 --ensemble-updates 12000)
-suite+=(--transitions 400000 --updates 10000 --ensemble-updates 24000)
+suite+=(--transitions 200000 --updates 10000 --ensemble-updates 24000)
 horizon=(--trajectories 300 --online 100)
 robots="hopper halfcheetah walker2d ant"
 changed="halfcheetah walker2d"
@@ -90,3 +90,9 @@ wait
 measure calibrate calibrate "${calibrate[@]}" --robots $robots
 measure model_small "${speed[@]}" --preset $small
 measure cost bench cost "${suite[@]}"
+
+echo "$((SECONDS - begin)) s in all; results in $out"
+if ((${#failed[@]})); then
+  printf 'not measured: %s\n' "${failed[@]}" >&2
+  exit 1
+fi
