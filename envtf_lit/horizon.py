@@ -50,7 +50,8 @@ class HorizonOptions:
     Attributes:
         trajectories: fresh episodes of the tier's behaviour policies, from their first step.
         online: fresh episodes of each of the three online policies.
-        start: steps of each episode that are left out, and with them the episodes that end before.
+        start: steps of each episode that are left out, and with them the episodes that end before, and an online
+            policy that has no other.
     """
 
     trajectories: int = 300
@@ -169,22 +170,22 @@ class _Course:
         wanted = {RECORDED: (task, measured.trajectories)}
         wanted |= {name: (Task(task.robot, name), measured.online) for name in ONLINE}
         folder = run_folder(home, "episodes", self.key | {"measured.start": 0}, [])  # the same from every start
-        self.trajectories = {
+        fresh = {
             source: self._fresh(folder / f"{source}.h5", *ask, workers=suite.options.threads, progress=progress)
             for source, ask in wanted.items()
         }
+        self.trajectories = {source: found for source, found in fresh.items() if len(found.lengths) > 0}
+        if RECORDED not in self.trajectories:
+            raise UserError(
+                f"No episode of {task.name} lasts longer than {self.start} steps: start earlier, or take more episodes."
+            )
         self.scale, self.physics = Scale.of(suite.split()[0], self.device), Physics(task.robot)
 
     def _fresh(self, file: Path, task: Task, count: int, *, workers: int, progress: bool) -> Trajectories:
         if not file.exists():
             seed = self.seed + SEED_OFFSET
             save_dataset(fresh_episodes(task, count, seed=seed, workers=workers, progress=progress), file)
-        found = whole_episodes(load_dataset(file), count, seed=self.seed).later(self.start)
-        if len(found.lengths) == 0:
-            raise UserError(
-                f"No episode of {task.name} lasts longer than {self.start} steps: start earlier, or take more episodes."
-            )
-        return found.to(self.device)
+        return whole_episodes(load_dataset(file), count, seed=self.seed).later(self.start).to(self.device)
 
     @property
     def episodes(self) -> str:
@@ -241,7 +242,7 @@ def page(found: Mapping[str, Results], tier: str) -> str:
                 continue
             numbers = sources[RECORDED].numbers
             offline.append(_offline_row(robot, model, numbers))
-            for source in ONLINE:
+            for source in (source for source in ONLINE if source in sources):
                 online.append((robot, model, source, *_online_cells(sources[source].numbers)))
     tables = (
         (f"Recorded actions of {tier}", OFFLINE_HEAD, offline),
@@ -292,7 +293,8 @@ def draw(found: Mapping[str, Results], folder: Path) -> None:
     recorded, online = curves.query("source == @RECORDED"), curves.query("source != @RECORDED")
     horizons.error_growth(recorded, "open_loop", folder / "open_loop.png")
     horizons.error_growth(recorded, "teacher_forced", folder / "teacher_forced.png")
-    horizons.online_growth(online, folder / "online.png")
+    if len(online):
+        horizons.online_growth(online, folder / "online.png")
     horizons.steps_against_ceiling(_lengths(found), folder / "ceiling.png")
 
 

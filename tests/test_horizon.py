@@ -13,6 +13,7 @@ from envtf_lit import horizon, tasks
 from envtf_lit.cli import main
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation import tracking
+from envtf_lit.evaluation.tracking import fresh_episodes
 from envtf_lit.horizon import ONLINE, SIZES, HorizonOptions, compare
 from envtf_lit.params import EnsembleOptions
 from envtf_lit.suite import MODELS, Suite, SuiteOptions, build_suite
@@ -70,6 +71,22 @@ def test_every_model_is_measured_once_and_all_of_it_is_written(tmp_path: Path) -
     assert numbers.items() <= again.items()
     assert again["hopper.mine.open_loop_0.1"] == numbers["hopper.ensemble.open_loop_0.1"]
     assert kept == {path: path.stat().st_mtime_ns for path in kept}
+
+
+@pytest.mark.usefixtures("short_episodes")
+def test_a_policy_whose_episodes_all_end_before_the_start_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fresh(task: Task, *arguments: Any, **options: Any) -> Any:
+        steps = 3 if task.tier == "random" else 12
+        return fresh_episodes(replace(task, robot=replace(task.robot, max_episode_steps=steps)), *arguments, **options)
+
+    monkeypatch.setattr(horizon, "fresh_episodes", fresh)
+    numbers = run(tmp_path, [], models=["ensemble"], measured=HorizonOptions(4, 2, start=5))
+    assert not any(".random." in key for key in numbers)
+    assert "hopper.ensemble.expert.open_loop_0.1" in numbers
+    assert "| random |" not in (tmp_path / "out/horizon.md").read_text()
+    assert set(pd.read_csv(tmp_path / "out/horizon/online.csv")["source"]) == {"medium", "expert"}
 
 
 @pytest.mark.usefixtures("short_episodes")

@@ -38,18 +38,24 @@ def error_growth(curves: pd.DataFrame, run: str, path: str | Path) -> Path:
 
 
 def online_growth(curves: pd.DataFrame, path: str | Path) -> Path:
-    """The open-loop errors along the actions of policies that drive MuJoCo: a row per policy, a column per robot."""
+    """The open-loop errors along the actions of policies that drive MuJoCo: a row per policy, a column per robot.
+
+    A panel stays empty where a robot has no episode of a policy.
+    """
     shown = curves.query("run == 'open_loop'")
     robots, policies, looks = shown["robot"].unique(), shown["source"].unique(), model_looks(shown["model"].unique())
     with drawing(path, _size(len(robots), 2.6 * len(policies)), len(policies), len(robots)) as (figure, axes):
         for row, policy in zip(axes, policies, strict=True):
             for axis, robot in zip(row, robots, strict=True):
-                _panel(axis, shown.query("robot == @robot and source == @policy"), looks)
+                if (lines := shown.query("robot == @robot and source == @policy")).empty:
+                    axis.set_axis_off()
+                    continue
+                _panel(axis, lines, looks)
                 axis.set_title(f"{robot}, {policy} policy", fontsize="medium")
             row[0].set_ylabel("normalised squared error")
         for axis in axes[-1]:
             axis.set_xlabel("step h")
-        _legend(axes[0, -1])
+        _legend(next(axis for axis in axes[:, -1] if axis.lines))
         figure.suptitle("Error on the actions of policies that drive MuJoCo:\nopen loop (median, quartiles)")
     write_table(path, shown)
     return Path(path)
