@@ -68,7 +68,9 @@ def test_an_exploding_model_is_counted_and_leaves_finite_numbers() -> None:
     exploding.matrix = 1e3 * exploding.matrix
     trajectories, scale = whole_episodes(data, 2, seed=0), Scale.of(data)
     found = track(exploding, trajectories, scale) | track_sampled(exploding, trajectories, scale, seed=0)
-    assert found.numbers["explosion_rate"] == 1.0
+    assert found.numbers["explosion_rate"] == found.numbers["explosion_rate_standing"] == 1.0
+    fallen = track(exploding, trajectories, scale, lambda states: states.abs().amax(-1) > 5 * scale.std.max())
+    assert fallen.numbers.items() <= (found.numbers | {"explosion_rate_standing": 0.0}).items()
     assert found.numbers["open_loop_0.1"] == 0.0 == found.numbers["open_loop_0.1_censored"]
     assert all(math.isfinite(value) for value in found.numbers.values())
     assert all(np.isfinite(column).all() for run in found.curves.values() for column in run.values())

@@ -4,7 +4,7 @@ The metric is the paper's (its section on long-horizon rollouts), made definite:
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,10 +15,12 @@ from torch import Tensor
 from envtf_lit.data.behaviour import collect
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.physics import Ceiling
-from envtf_lit.tasks import Task
+from envtf_lit.tasks import Task, never_terminated
 from envtf_lit.world_models.horizon import (
+    EXPLODED,
     LARGEST,
     THRESHOLDS,
+    HorizonReport,
     Scale,
     Steps,
     Trajectories,
@@ -70,8 +72,20 @@ class Tracking:
         return Tracking(self.numbers | other.numbers, self.curves | other.curves)
 
 
-def track(model: WorldModel, trajectories: Trajectories, scale: Scale) -> Tracking:
-    """Open-loop and teacher-forced lengths, with mean predictions from the first recorded state alone."""
+def track(
+    model: WorldModel,
+    trajectories: Trajectories,
+    scale: Scale,
+    terminated: Callable[[Tensor], Tensor] = never_terminated,
+) -> Tracking:
+    """Open-loop and teacher-forced lengths, with mean predictions from the first recorded state alone.
+
+    Args:
+        model: any world model, in eval mode, on the trajectories' device.
+        trajectories: what really happened.
+        scale: of errors.
+        terminated: the robot's rule, of next observations (..., S).
+    """
     report, lengths = horizon_report(model, trajectories, scale), trajectories.lengths
     taught = report.teacher_forced_nmse
     numbers = {
@@ -80,12 +94,20 @@ def track(model: WorldModel, trajectories: Trajectories, scale: Scale) -> Tracki
         "one_step_nrmse": math.sqrt(min(report.nmse_one_step, LARGEST)),
         "one_step_typical": math.sqrt(min(float(taught[trajectories.valid].median()), LARGEST)),
         "explosion_rate": report.explosion_rate,
+        "explosion_rate_standing": _exploded_standing(report, terminated),
         **_numbers("open_loop", report.open_loop),
         **_numbers("teacher_forced", report.teacher_forced),
         **{f"open_loop_nmse_at_{h}": min(value, LARGEST) for h, value in report.median_nmse.items()},
     }
     errors = {"open_loop": report.open_loop_nmse, "teacher_forced": taught}
     return Tracking(numbers, {run: _curve(error, lengths) for run, error in errors.items()})
+
+
+def _exploded_standing(report: HorizonReport, terminated: Callable[[Tensor], Tensor]) -> float:
+    """Share of trajectories that explode before the model's own robot falls, where imagination would end them."""
+    fallen = terminated(report.imagined.mean[..., :-1]).int().cummax(1).values.bool()  # (B, T)
+    exploded = (report.open_loop_nmse > EXPLODED) & report.trajectories.valid & ~fallen
+    return float(exploded.any(1).double().mean())
 
 
 def track_sampled(model: WorldModel, trajectories: Trajectories, scale: Scale, *, seed: int) -> Tracking:
