@@ -165,7 +165,6 @@ class _Course:
         self.seed, self.start = suite.options.seed, measured.start
         self.device, self.robot = pick_device(), task.robot
         self.key = flat_settings(task.tier, suite.options, measured=measured)
-        self.key["explosions"] = "before the fall, too"  # results without them are older
         if measured.start > 0 and task.robot.clipped_from is not None:
             self.key["clipped_starts"] = "left out"  # they once counted, and results of then are others
         wanted = {RECORDED: (task, measured.trajectories)}
@@ -180,6 +179,7 @@ class _Course:
             raise UserError(
                 f"No episode of {task.name} lasts longer than {self.start} steps: start earlier, or take more episodes."
             )
+        self.key["explosions"] = "before the fall, too"  # results without them are older
         self.scale, self.physics = Scale.of(suite.split()[0], self.device), Physics(task.robot)
 
     def _fresh(self, file: Path, task: Task, count: int, *, workers: int, progress: bool) -> Trajectories:
