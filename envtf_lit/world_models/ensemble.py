@@ -239,7 +239,7 @@ class EnsembleDynamics(nn.Module):
         return value
 
     def fuse(self) -> None:
-        """See `WorldModel.fuse`."""
+        """Lets `step` run through torch.compile from now on."""
         self.step = torch.compile(self.step, dynamic=True)  # the number of rows changes
 
     def observe(self, state: EnsembleState, observation: Tensor) -> EnsembleState:

@@ -78,13 +78,6 @@ class WorldModel(Protocol):
         """Acts with (B, A) in every row; the next observation is the mean, or a draw with `generator`."""
         ...
 
-    def fuse(self) -> None:
-        """Lets `step` run through torch.compile from now on: the same numbers up to rounding, in fewer kernels.
-
-        The first steps then take a minute. It pays on a GPU, where launching many small kernels is what takes the time.
-        """
-        ...
-
     def observe(self, state: Any, observation: Tensor) -> Any:
         """Replaces the current observation (B, S) by what was really seen (teacher forcing, online use)."""
         ...

@@ -26,12 +26,13 @@ def load_world_model(folder: str | Path, *, fused: bool = False) -> Any:
 
     Args:
         folder: as `save_world_model` wrote it.
-        fused: compile its steps, see `WorldModel.fuse`.
+        fused: its steps run through torch.compile: the same numbers up to rounding, in fewer kernels. The first ones
+            then take a minute; it pays on a GPU, where launching many small kernels is what takes the time.
 
     Raises:
         UserError: the folder is missing, damaged, or holds something that is not a world model.
     """
-    model = load_module(folder, WORLD_MODELS).requires_grad_(False)
+    model: Any = load_module(folder, WORLD_MODELS).requires_grad_(False)
     if fused:
         model.fuse()
     return model

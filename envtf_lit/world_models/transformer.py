@@ -435,7 +435,7 @@ class EnvironmentTransformer(nn.Module):
         return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
 
     def fuse(self) -> None:
-        """See `WorldModel.fuse`. Blocks are compiled one by one: they are alike, so that one serves all."""
+        """Lets `step` run through torch.compile from now on: by blocks, which are alike, so that one serves all."""
         for block in self._stack():
             block.advance = torch.compile(block.advance, dynamic=True)  # the clock and the number of rows change
         self.predict = torch.compile(self.predict, dynamic=True)
