@@ -2,10 +2,10 @@
 # Everything that a GPU is worth, in one command of at most 25 minutes: benchmarks/gpu.sh [FOLDER]
 #
 # The most valuable comes first, and each result is kept in FOLDER (default: benchmarks/gpu) as soon as it is there,
-# with device and versions inside; machine.txt holds `envtf doctor`, and a .log lies beside each result. One such model does
-# not fill a GPU: the robots of all comparisons train and are measured side by side, so that their train_seconds are of
-# a shared machine; speeds are measured before and after, alone. What fails or runs out of time is named at the end;
-# what it had measured by then lies in FOLDER/work.
+# with device and versions inside; machine.txt holds `envtf doctor`, and a .log lies beside each result. One such model
+# does not fill a GPU: the robots of all comparisons train and are measured side by side, so that their train_seconds
+# are of a shared machine; speeds are measured before and after, alone. What fails or runs out of time is named at the
+# end; what it had measured by then lies in FOLDER/work.
 #
 #   MINUTES=10 benchmarks/gpu.sh                  less time
 #   QUICK=1 benchmarks/gpu.sh /tmp/try            every part on budgets of seconds, on any machine: a rehearsal
@@ -59,10 +59,10 @@ aside() {
 }
 
 speed=(bench model --rounds 3 --compile)
-suite=(--quiet --compile --work "$work" --threads 4 --windows 256)
-hidden=("${suite[@]}" --windows 128 --transitions 200000 --updates 12000 --ensemble-updates 24000)
-calibrate=("${suite[@]}" --updates 5000 --ensemble-updates 12000)
-suite+=(--transitions 200000 --updates 10000 --ensemble-updates 24000)
+common=(--quiet --compile --work "$work" --threads 4)
+suite=("${common[@]}" --windows 256 --transitions 200000 --updates 10000 --ensemble-updates 24000)
+hidden=("${common[@]}" --windows 128 --transitions 200000 --updates 12000 --ensemble-updates 24000)
+calibrate=("${common[@]}" --windows 256 --updates 5000 --ensemble-updates 12000)
 horizon=(--trajectories 300 --online 100)
 robots="hopper halfcheetah walker2d ant"
 changed="halfcheetah walker2d"

@@ -161,7 +161,7 @@ class _Course:
     """
 
     def __init__(self, task: Task, suite: Suite, home: Path, measured: HorizonOptions, progress: bool) -> None:
-        self.home, self.dataset, self.options = home, suite.dataset, suite.options
+        self.home, self.suite = home, suite
         self.seed, self.start = suite.options.seed, measured.start
         self.device, self.robot = pick_device(), task.robot
         self.key = flat_settings(task.tier, suite.options, measured=measured)
@@ -200,7 +200,7 @@ class _Course:
         """A model's results by source of the episodes; the recorded ones with ceilings at its own one-step error."""
 
         def work() -> dict[str, Tracking]:
-            model = measurable(folder, self.options)
+            model = measurable(folder, self.suite.options)
             sources, rule = self.trajectories.items(), self.robot.terminated
             found = {source: track(model, episodes, self.scale, rule) for source, episodes in sources}
             drawn = track_sampled(model, self.trajectories[RECORDED], self.scale, seed=self.seed)
@@ -220,7 +220,7 @@ class _Course:
         def plain() -> dict[str, Any]:
             return {source: asdict(tracking) for source, tracking in work().items()}
 
-        found = kept(self.home, f"horizon-{name}", self.key, [self.dataset, *inputs], plain)
+        found = kept(self.home, f"horizon-{name}", self.key, [self.suite.dataset, *inputs], plain)
         return {source: Tracking(**content) for source, content in found.items()}
 
 
@@ -244,8 +244,9 @@ def page(found: Mapping[str, Results], tier: str) -> str:
                 continue
             numbers = sources[RECORDED].numbers
             offline.append(_offline_row(robot, model, numbers))
-            for source in (source for source in ONLINE if source in sources):
-                online.append((robot, model, source, *_online_cells(sources[source].numbers)))
+            for source, tracking in sources.items():
+                if source != RECORDED:
+                    online.append((robot, model, source, *_online_cells(tracking.numbers)))
     tables = (
         (f"Recorded actions of {tier}", OFFLINE_HEAD, offline),
         ("Actions of policies that drive MuJoCo", ONLINE_HEAD, online),

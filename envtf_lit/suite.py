@@ -34,6 +34,7 @@ from envtf_lit.world_models.store import load_world_model
 MODELS = ("transformer", "context_1", "ensemble")  # their names in every table, figure and file
 PHYSICS = "physics"  # what stands beside them under that name, so that no other model may have it
 WORDS = ("trained_with", "note")  # of a dataset's origin: about the whole series, of which a tier may use a part
+SHARED = ("seed", "threads", "precision", "compile")  # options that a suite has in common with `Params`
 WORK = Path(".envtf/suite")  # where suites are kept unless told otherwise
 
 
@@ -106,7 +107,7 @@ def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str
         options: of the data and the models.
         measured: dataclasses that say what is measured, under the name that goes before their keys.
     """
-    kept = ("transitions", "updates", "windows", "context", "seed", "threads", "precision", "compile")
+    kept = ("transitions", "updates", "windows", "context", *SHARED)
     return {
         "tier": tier,
         **{f"suite.{name}": getattr(options, name) for name in kept},
@@ -218,8 +219,7 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
     check_world_model(options)
     home, shared = suite.dataset.parents[1], suite.options
     params = replace(Params(), task=suite.task, train_model=options, **_common(shared))
-    key = {"task": suite.task, "transitions": shared.transitions, "seed": shared.seed}
-    key |= {"threads": shared.threads, "precision": shared.precision, "compile": shared.compile}
+    key = {"task": suite.task, "transitions": shared.transitions, **{name: getattr(shared, name) for name in SHARED}}
     key |= {"train_model": _plain(asdict(options)), "dataset": sha256(suite.dataset)}
     suite.folders[name] = home / "models" / name
     train = partial(_train, params, suite.dataset, suite.folders[name], home, progress)
@@ -241,8 +241,7 @@ def _plain(options: dict[str, Any]) -> dict[str, Any]:
 def _common(options: SuiteOptions) -> dict[str, Any]:
     """What the stages' parameters take over from the suite's."""
     download = DownloadOptions(transitions=options.transitions)
-    shared = {name: getattr(options, name) for name in ("seed", "threads", "precision", "compile")}
-    return shared | {"download": download}
+    return {name: getattr(options, name) for name in SHARED} | {"download": download}
 
 
 def model_params(name: str, task: str, options: SuiteOptions) -> Params:

@@ -410,9 +410,8 @@ def test_multi_step_learns_from_its_own_predictions_with_gradients_through_them(
 
 
 def test_fused_steps_equal_plain_ones(monkeypatch: pytest.MonkeyPatch):
-    through_dynamo = partial(
-        torch.compile, backend="eager"
-    )  # what inductor then makes of the graphs is its own business
+    # what inductor makes of the graphs is its own business
+    through_dynamo = partial(torch.compile, backend="eager")
     plain, fused = (make_model().requires_grad_(False) for _ in range(2))
     monkeypatch.setattr(torch, "compile", through_dynamo)
     fused.fuse()
