@@ -12,7 +12,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.params import ModelOptions
 from envtf_lit.world_models.interface import Prediction
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
-from envtf_lit.world_models.transformer import LARGE_CACHE, Attention, EnvironmentTransformer, rotate
+from envtf_lit.world_models.transformer import LARGE_CACHE, Attention, EnvironmentTransformer, rotate, rotation
 
 S, A = 5, 2
 
@@ -157,7 +157,8 @@ def test_sampling_is_seeded_and_has_the_predicted_moments():
 
 def test_rotary_products_depend_on_the_distance_alone():
     q, k = torch.randn(1, 8), torch.randn(1, 8)
-    product = lambda i, j: (rotate(q, torch.tensor([i])) * rotate(k, torch.tensor([j]))).sum()  # noqa: E731
+    turned = lambda x, position: rotate(x, rotation(torch.tensor([position]), 8))  # noqa: E731
+    product = lambda i, j: (turned(q, i) * turned(k, j)).sum()  # noqa: E731
     torch.testing.assert_close(product(3, 1), product(103, 101), rtol=1e-4, atol=1e-4)
 
 

@@ -26,14 +26,19 @@ LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -14.0, 4.0
 LARGE_CACHE = 2**18  # numbers; beyond, a CPU takes the cache token by token, whose products then stay in its own caches
 
 
-def rotate(x: Tensor, positions: Tensor) -> Tensor:
-    """Rotary position embedding (Su et al. 2021) of (..., d) at integer positions (...), broadcast against it."""
-    half = x.shape[-1] // 2
-    frequency = 10_000.0 ** (-torch.arange(half, device=x.device, dtype=torch.float32) / half)
-    angle = positions.float()[..., None] * frequency  # (..., d/2)
-    cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
-    first, second = x[..., :half], x[..., half:]
-    return torch.cat([first * cos - second * sin, second * cos + first * sin], dim=-1)
+def rotation(positions: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    """Cosines and signed sines (..., width) of the rotary embedding (Su et al. 2021) at integer positions (...)."""
+    half = width // 2
+    frequency = 10_000.0 ** (-torch.arange(half, device=positions.device, dtype=torch.float32) / half)
+    angle = positions.float()[..., None] * frequency  # (..., width/2)
+    sin = angle.sin()
+    return torch.cat([angle.cos()] * 2, -1), torch.cat([-sin, sin], -1)
+
+
+def rotate(x: Tensor, cos_sin: tuple[Tensor, Tensor]) -> Tensor:
+    """Heads (..., d) turned by a `rotation`, broadcast against them: entries i and i + d/2 are one pair."""
+    cos, sin = cos_sin
+    return x * cos.to(x.dtype) + x.roll(x.shape[-1] // 2, -1) * sin.to(x.dtype)
 
 
 def window_mask(length: int, context: int, device: torch.device) -> Tensor:
@@ -51,12 +56,13 @@ class Attention(nn.Module):
         self.qkv = nn.Linear(options.width, 3 * options.width)
         self.out = nn.Linear(options.width, options.width)
 
-    def project(self, x: Tensor, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(B, T, D) to rotated queries and keys, and values, each (B, H, T, d)."""
+    def project(self, x: Tensor, cos_sin: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """(B, T, D), and the `rotation` (T, d), to rotated queries and keys, and values, each (B, H, T, d)."""
         B, T, D = x.shape
         qkv = self.qkv(x).view(B, T, 3, self.heads, D // self.heads)
-        q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, T, d)
-        return rotate(q, positions), rotate(k, positions), v
+        cos, sin = cos_sin
+        q, k = rotate(qkv[:, :, :2], (cos[:, None, None], sin[:, None, None])).permute(2, 0, 3, 1, 4)
+        return q, k, qkv[:, :, 2].transpose(1, 2)
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
         """Whole sequences (B, H, T, d); `mask` None means plain causal attention."""
@@ -126,12 +132,17 @@ class Block(nn.Module):
         self.dropout = nn.Dropout(options.dropout)
 
     def advance(
-        self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None, clock: int
+        self,
+        x: Tensor,
+        keys: Tensor,
+        values: Tensor,
+        mask: Tensor | None,
+        clock: int,
+        cos_sin: tuple[Tensor, Tensor],
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The next token (B, D) of all rows, given the cache that it is written to; its output, and the cache."""
         context = keys.shape[0]
-        position = torch.full((1,), clock, device=x.device)
-        q, k, v = self.attention.project(self.attention_norm(x)[:, None], position)
+        q, k, v = self.attention.project(self.attention_norm(x)[:, None], cos_sin)
         slot, filled = clock % context, min(clock + 1, context)
         keys, values = _write(keys, k[:, :, 0], slot), _write(values, v[:, :, 0], slot)
         return self.finish(x, self.attention.recall(q[:, :, 0], keys[:filled], values[:filled], mask)), keys, values
@@ -262,16 +273,19 @@ class EnvironmentTransformer(nn.Module):
     ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
         """Last hidden tokens (B, T, D) and, if `cached`, each layer's keys and values (B, H, T, d)."""
         T = observations.shape[1]
-        positions = torch.arange(T, device=observations.device)
-        mask = window_mask(T, self.options.context, positions.device) if T > self.options.context else None
+        mask = window_mask(T, self.options.context, observations.device) if T > self.options.context else None
+        cos_sin = self._rotation(torch.arange(T, device=observations.device))
         x = self.embed(self.normaliser.token(observations, actions))
         cache = []
         for block in self._stack():
-            q, k, v = block.attention.project(block.attention_norm(x), positions)
+            q, k, v = block.attention.project(block.attention_norm(x), cos_sin)
             if cached:
                 cache.append((k, v))
             x = block.finish(x, block.attention(q, k, v, mask))
         return self.norm(x), cache
+
+    def _rotation(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        return rotation(positions, self.options.width // self.options.heads)
 
     def heads(self, hidden: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Hidden tokens (..., D) to mean, log-variance, epistemic log-variance or None, each (..., S + 1), in fp32."""
@@ -404,7 +418,7 @@ class EnvironmentTransformer(nn.Module):
             _, tokens = self.encode(observations[:, :-1], actions, cached=True)
             for (keys, values), (k, v) in zip(cache, tokens, strict=True):
                 k, v = (x.transpose(1, 2)[window, index.clamp(min=0)] for x in (k, v))  # (clock, B, H, d)
-                keys[:clock], values[:clock] = rotate(k.float(), shift[:, None]), v
+                keys[:clock], values[:clock] = rotate(k.float(), self._rotation(shift[:, None])), v
         drawn = posterior * self._posterior().draw(B, generator) if posterior > 0 else None
         return TransformerState(cache, clock, first, current, drawn)
 
@@ -427,9 +441,10 @@ class EnvironmentTransformer(nn.Module):
         """See `WorldModel.step`. One token per call; the cache is written in place unless gradients are needed."""
         x = self.embed(self.normaliser.token(state.observation, action))  # (B, D)
         mask = self._visible(state, min(state.clock + 1, self.options.context))
+        cos_sin = self._rotation(torch.full((1,), state.clock, device=x.device))
         cache = []
         for block, (keys, values) in zip(self._stack(), state.cache, strict=True):
-            x, keys, values = block.advance(x, keys, values, mask, state.clock)
+            x, keys, values = block.advance(x, keys, values, mask, state.clock, cos_sin)
             cache.append((keys, values))
         prediction = self.predict(self.norm(x), state.observation, state.drawn, mode=mode, generator=generator)
         return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
