@@ -23,9 +23,9 @@ from envtf_lit.params import (
     ValueGradientOptions,
 )
 from envtf_lit.storage import load_weights
-from envtf_lit.training import run_folder
+from envtf_lit.training import fit, run_folder
 from envtf_lit.world_models.horizon import Scale, open_loop_error, segments
-from envtf_lit.world_models.lit import SELECTION_HORIZON, SELECTION_SEGMENTS
+from envtf_lit.world_models.lit import SELECTION_HORIZON, SELECTION_SEGMENTS, lit_world_model, window_data
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.walker import walker_dataset
@@ -76,6 +76,17 @@ class Killer(Callback):
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: object) -> None:
         if trainer.current_epoch == self.epoch:
             raise Killed
+
+
+class Norms(Callback):
+    """Notes how large the gradients are that a step was made with."""
+
+    def __init__(self) -> None:
+        self.seen = list[float]()
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: object) -> None:
+        gradients = [weight.grad.norm() for weight in pl_module.parameters() if weight.grad is not None]
+        self.seen.append(torch.stack(gradients).norm().item())
 
 
 @pytest.fixture
@@ -160,6 +171,26 @@ def test_compiled_training_learns_what_plain_training_learns(root, monkeypatch):
         weights.append(load_world_model(root / pipeline.WORLD_MODEL).state_dict())
     assert len(compiled) == 1
     torch.testing.assert_close(weights[1], weights[0])
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_gradients_are_clipped_before_a_step_in_one_pass(root, precision):
+    options = TINY.train_model
+    data = window_data(str(root / "data/dataset.h5"), options, seed=0)
+    lit = lit_world_model(data.observation_dim, data.action_dim, options)
+    norms = Norms()
+    fit(
+        lit,
+        data,
+        run=root / "run",
+        epochs=1,
+        precision=precision,
+        progress=False,
+        gradient_clip=1e-3,
+        callbacks=[norms],
+    )
+    assert norms.seen == pytest.approx([1e-3] * options.updates_per_epoch, rel=1e-2)
+    assert lit.configure_optimizers()["optimizer"].defaults["fused"]
 
 
 def test_gradient_steps_are_those_asked_for(root):

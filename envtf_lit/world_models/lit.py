@@ -170,6 +170,25 @@ class LitWorldModel(L.LightningModule):
                 error = open_loop_error(self.kept, self.segments, self.scale)
             self.log(f"{split}/open_loop_error", error, prog_bar=split == "val", batch_size=1, sync_dist=True)
 
+    @property
+    def _scales_gradients(self) -> bool:
+        """Whether fp16 does so. An optimiser that makes its step in one pass would undo it, but after the clipping."""
+        return self._trainer is not None and getattr(self.trainer.precision_plugin, "scaler", None) is not None
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: int | float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """As Lightning clips, but for one-pass optimisers too, which it refuses even where nothing is scaled (bf16)."""
+        if self._scales_gradients:
+            self.clip_gradients(optimizer, gradient_clip_val, gradient_clip_algorithm)
+        elif gradient_clip_val:
+            plugin = self.trainer.precision_plugin
+            clip = plugin.clip_grad_by_value if gradient_clip_algorithm == "value" else plugin.clip_grad_by_norm
+            clip(optimizer, gradient_clip_val)
+
     def configure_optimizers(self) -> dict[str, Any]:
         o = self.options
         matrices, vectors = [], []
@@ -179,6 +198,7 @@ class LitWorldModel(L.LightningModule):
             [dict(params=matrices, weight_decay=o.weight_decay), dict(params=vectors, weight_decay=0.0)],
             lr=o.learning_rate,
             eps=o.eps,
+            fused=not self._scales_gradients,
         )
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate)
         return dict(optimizer=optimizer, lr_scheduler=dict(scheduler=schedule, interval="step"))
@@ -280,7 +300,7 @@ class LitEnsemble(LitWorldModel):
         self.stale = torch.where(improved.any(), 0, self.stale + 1)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.Adam(self.model.parameters(), lr=self.ensemble.learning_rate)
+        return torch.optim.Adam(self.model.parameters(), lr=self.ensemble.learning_rate, fused=True)
 
 
 def _start_from(model: Any, other: Any, folder: str) -> None:
