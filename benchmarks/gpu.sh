@@ -5,9 +5,10 @@
 # with device and versions inside; machine.txt holds `envtf doctor`, and a .log lies beside each result. One such model
 # does not fill a GPU: the robots of all comparisons train and are measured side by side, so that their train_seconds
 # are of a shared machine; speeds are measured before and after, alone. What fails or runs out of time is named at the
-# end; what it had measured by then lies in FOLDER/work.
+# end; what it had measured by then lies in FOLDER/work, and with WORK the same call goes on where it stopped.
 #
 #   MINUTES=10 benchmarks/gpu.sh                  less time
+#   WORK=.envtf/suite benchmarks/gpu.sh           keeps what was trained, too, and uses what lies there
 #   QUICK=1 benchmarks/gpu.sh /tmp/try            every part on budgets of seconds, on any machine: a rehearsal
 #   ENVTF="python -m envtf_lit" benchmarks/gpu.sh another way to call envtf
 set -uo pipefail
@@ -18,8 +19,9 @@ read -ra envtf <<<"${ENVTF:-envtf}"
 begin=$SECONDS
 failed=()
 mkdir -p "$out"
-work=$(mktemp -d)
-trap 'keep; rm -rf "$work"' EXIT
+work=${WORK:-$(mktemp -d)}
+mkdir -p "$work"
+trap 'keep; [[ -n ${WORK:-} ]] || rm -rf "$work"' EXIT
 
 # keep: saves what was measured of each model, in FOLDER/work: of a comparison that ran out of time nothing else is left
 keep() {
@@ -59,11 +61,12 @@ aside() {
 }
 
 speed=(bench model --rounds 3 --compile)
-common=(--quiet --compile --work "$work" --threads 4)
-suite=("${common[@]}" --windows 256 --transitions 200000 --updates 10000 --ensemble-updates 24000)
-hidden=("${common[@]}" --windows 128 --transitions 200000 --updates 12000 --ensemble-updates 24000)
-calibrate=("${common[@]}" --windows 256 --updates 5000 --ensemble-updates 12000)
-horizon=(--trajectories 300 --online 100)
+# as they are: so many models at once wait for each other on the GPU, not for their own processor
+common=(--quiet --work "$work" --threads 2)
+suite=("${common[@]}" --windows 256 --transitions 200000 --updates 6000 --ensemble-updates 16000)
+hidden=("${common[@]}" --windows 128 --transitions 200000 --updates 10000 --ensemble-updates 20000)
+calibrate=("${common[@]}" --windows 256 --updates 4000 --ensemble-updates 8000)
+horizon=(--trajectories 300 --online 20)
 robots="hopper halfcheetah walker2d ant"
 changed="halfcheetah walker2d"
 paper=paper small=small
@@ -79,14 +82,13 @@ if [[ -n ${QUICK:-} ]]; then
 fi
 
 "${envtf[@]}" doctor >"$out/machine.txt"
-measure model_paper "${speed[@]}" --preset $paper --windows 128
-aside horizon "$robots" horizon "${suite[@]}" "${horizon[@]}"
+measure model_paper "${speed[@]}" --preset $paper --windows 512
 aside hidden "$changed" hidden "${hidden[@]}"
-wait
-measure horizon horizon "${suite[@]}" "${horizon[@]}" --robots $robots
-measure hidden hidden "${hidden[@]}" --robots $changed
+aside horizon "$robots" horizon "${suite[@]}" "${horizon[@]}"
 aside calibrate "$robots" calibrate "${calibrate[@]}"
 wait
+measure hidden hidden "${hidden[@]}" --robots $changed
+measure horizon horizon "${suite[@]}" "${horizon[@]}" --robots $robots
 measure calibrate calibrate "${calibrate[@]}" --robots $robots
 measure model_small "${speed[@]}" --preset $small
 measure cost bench cost "${suite[@]}"

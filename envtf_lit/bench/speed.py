@@ -87,6 +87,7 @@ def bench_model(
         actions |= _cache(body, options, place, batch, compile)
         actions |= {"real": lambda: _real(simulators, threads, real_steps)}
         timings = in_turns(actions, rounds, warm_up=warm_up)
+    del actions  # full caches, which training would have to share a GPU's memory with
     train, flops = _training(body, options, place, precision, updates, compile)
     learning = in_turns({"train": train, "matmul": _matmul(place, precision)}, rounds, warm_up=warm_up)
     steps, tokens = batch * horizon, updates * options.batch_size * options.model.context
