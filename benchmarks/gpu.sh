@@ -20,12 +20,11 @@ begin=$SECONDS
 failed=()
 mkdir -p "$out"
 work=${WORK:-$(mktemp -d)}
-mkdir -p "$work"
+mkdir -p "$work" "$out/work"
 trap 'keep; [[ -n ${WORK:-} ]] || rm -rf "$work"' EXIT
 
-# keep: saves what was measured of each model, in FOLDER/work: of a comparison that ran out of time nothing else is left
+# keep: saves what was measured of each model, in FOLDER/work: of a robot that ran out of time nothing else is left
 keep() {
-  mkdir -p "$out/work"
   (cd "$work" && find . \( -name '*.json' -o -name curves.csv \) -print0 | tar -c --null -T -) | tar -x -C "$out/work"
 }
 
@@ -51,11 +50,12 @@ measure() {
   keep
 }
 
-# aside NAME ROBOTS COMMAND…: the same for each robot alone, in the background; `measure NAME` then finds it all done
+# aside NAME ROBOTS COMMAND…: the same for each robot alone, in the background, its result in FOLDER/work as soon as it is
+# there; `measure NAME` then finds it all done
 aside() {
   local name=$1 robot
   for robot in $2; do
-    timeout "$(left)" "${envtf[@]}" "${@:3}" --robots "$robot" --out "$work/$name-$robot.json" \
+    timeout "$(left)" "${envtf[@]}" "${@:3}" --robots "$robot" --out "$out/work/$name-$robot.json" \
       >"$out/$name-$robot.log" 2>&1 &
   done
 }
@@ -82,7 +82,7 @@ if [[ -n ${QUICK:-} ]]; then
 fi
 
 "${envtf[@]}" doctor >"$out/machine.txt"
-measure model_paper "${speed[@]}" --preset $paper --windows 512
+measure model_paper "${speed[@]}" --preset $paper --windows 256
 aside hidden "$changed" hidden "${hidden[@]}"
 aside horizon "$robots" horizon "${suite[@]}" "${horizon[@]}"
 aside calibrate "$robots" calibrate "${calibrate[@]}"
