@@ -18,7 +18,6 @@ minutes=${MINUTES:-25}
 read -ra envtf <<<"${ENVTF:-envtf}"
 begin=$SECONDS
 failed=()
-mkdir -p "$out"
 work=${WORK:-$(mktemp -d)}
 mkdir -p "$work" "$out/work"
 trap 'keep; [[ -n ${WORK:-} ]] || rm -rf "$work"' EXIT
