@@ -25,7 +25,7 @@ from envtf_lit.evaluation.calibration import (
 )
 from envtf_lit.tasks import never_terminated
 from envtf_lit.world_models.horizon import Scale, forecast, whole_episodes
-from envtf_lit.world_models.recalibration import standardised_residuals
+from envtf_lit.world_models.recalibration import normal_scores
 
 NOISE = 0.05
 
@@ -110,7 +110,7 @@ def test_exact_predictions_without_spread_have_no_residual():
     data = linear_data((10,))
     trajectories = whole_episodes(data, 1, seed=0)
     taught = forecast(linear_world(std=0.0), trajectories, feedback="recorded")
-    residuals = standardised_residuals(taught, trajectories)
+    residuals = normal_scores(taught, trajectories)
     assert bool((residuals[:, 2] == 0.0).all())
     assert not bool(torch.isnan(residuals).any())
 

@@ -21,7 +21,8 @@ from envtf_lit.policy import Policy
 from envtf_lit.world_models.horizon import LARGEST, Forecast, Scale, Trajectories
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.normaliser import CONSTANT
-from envtf_lit.world_models.recalibration import half_width, standardised_residuals
+from envtf_lit.world_models.recalibration import normal_scores
+from envtf_lit.world_models.tails import crps, half_width, log_density
 
 FIRST_STEPS = 10  # of an episode: just after a reset robots are where they hardly ever are again
 
@@ -50,7 +51,7 @@ def coverage(taught: Forecast, trajectories: Trajectories, scale: Scale, level: 
         scale: says which dimensions are live.
         level: in (0, 1).
     """
-    share = (standardised_residuals(taught, trajectories).abs() <= half_width(level)).double().mean(0)  # (S + 1,)
+    share = (normal_scores(taught, trajectories).abs() <= half_width(level)).double().mean(0)  # (S + 1,)
     live = scale.live.tolist()
     by_dimension = tuple(value if alive else None for value, alive in zip(share.tolist(), live, strict=True))
     return Coverage(level, float(share[scale.live].mean()), by_dimension)
@@ -70,7 +71,7 @@ class ProperScores:
 
 
 def proper_scores(taught: Forecast, trajectories: Trajectories, scale: Scale) -> ProperScores:
-    """Scores of Gaussian one-step predictions at the recorded outcomes, mean over live dimensions and the reward.
+    """Scores of one-step predictions at the recorded outcomes, mean over live dimensions and the reward.
 
     Args:
         taught: the teacher-forced forecast of `horizon_report`; a spread below 1e-6 z-scored units counts as that.
@@ -81,10 +82,10 @@ def proper_scores(taught: Forecast, trajectories: Trajectories, scale: Scale) ->
     error, std = ((column[trajectories.valid] / scale.std)[:, scale.live].double() for column in columns)
     std = std.clamp(min=CONSTANT)
     z = error.nan_to_num(nan=math.inf) / std
-    nll = 0.5 * z.square() + std.log() + 0.5 * math.log(2.0 * math.pi)
-    density = math.sqrt(2.0 / math.pi) * torch.exp(-0.5 * z.square())  # twice that of z
-    crps = std * (z * torch.erf(z / math.sqrt(2.0)) + density - 1.0 / math.sqrt(math.pi))  # Gneiting and Raftery 2007
-    return ProperScores(*(min(float(score.mean()), LARGEST) for score in (nll, crps)))
+    tail = torch.zeros_like(scale.std) if taught.tail is None else taught.tail
+    tail = tail[scale.live].double()
+    scores = std.log() - log_density(z, tail), std * crps(z, tail)
+    return ProperScores(*(min(float(score.mean()), LARGEST) for score in scores))
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,10 +126,12 @@ class Forecast:
     Attributes:
         mean: (B, T, S + 1) of the next observation and, last, the reward; their draws, if sampled.
         std: (B, T, S + 1), `sqrt(aleatoric^2 + epistemic^2)`, of that one step given the state it started from.
+        tail: (S + 1,) of the predictive distributions (`world_models.tails`); None: they are Gaussian.
     """
 
     mean: Tensor
     std: Tensor
+    tail: Tensor | None = None
 
 
 @torch.no_grad()
@@ -157,7 +159,7 @@ def forecast(
     rows = torch.argsort(trajectories.lengths, descending=True, stable=True)
     running = trajectories.valid.sum(0).tolist()  # trajectories that last until each step
     mean = torch.zeros_like(trajectories.targets)
-    std = torch.zeros_like(trajectories.targets)
+    std, tail = torch.zeros_like(trajectories.targets), None
     first, none = trajectories.observations[rows, :1], trajectories.actions[rows, :0]
     state = model.init(first, none, torch.ones_like(trajectories.lengths))
     for t in range(trajectories.actions.shape[1]):
@@ -169,8 +171,8 @@ def forecast(
         state, prediction = model.step(state, trajectories.actions[rows, t], mode=mode, generator=generator)
         sampled = torch.cat([prediction.observation, prediction.reward[:, None]], dim=-1)
         mean[rows, t] = prediction.mean if mode == "mean" else sampled
-        std[rows, t] = _total_std(prediction)
-    return Forecast(mean, std)
+        std[rows, t], tail = _total_std(prediction), prediction.tail
+    return Forecast(mean, std, tail)
 
 
 def _total_std(prediction: Prediction) -> Tensor:

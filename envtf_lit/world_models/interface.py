@@ -17,13 +17,15 @@ class Prediction:
         observation: (B, S) next state.
         reward: (B,).
         mean: (B, S + 1) the predictive mean of (next observation, reward).
-        aleatoric: (B, S + 1) standard deviation of (next observation, reward) from the data's own noise.
+        aleatoric: (B, S + 1) standard deviation of (next observation, reward) from the data's own noise; with a `tail`,
+            of the Gaussian that has the same 90 % interval.
         epistemic: (B, S + 1) standard deviation from lack of data, or None where the model has no such estimate.
         uncertainty: (B,) `||sqrt(S_au + S_eu)||_2 / sqrt(S)` over z-scored live observation dimensions: the penalty u.
         novelty: (B,) epistemic variance as a multiple of its 0.999 quantile over the training data: beyond 1 the model
             has left what it knows. None where the model has no such estimate.
         log_prob: (B,) log-density of (observation, reward) under the predictive distribution; gradients reach the
             distribution alone, not the draw.
+        tail: (S + 1,) how heavy the tails of the predictive distribution are (`world_models.tails`); None: Gaussian.
     """
 
     observation: Tensor
@@ -34,6 +36,7 @@ class Prediction:
     uncertainty: Tensor
     novelty: Tensor | None
     log_prob: Tensor
+    tail: Tensor | None = None
 
 
 class WorldModel(Protocol):

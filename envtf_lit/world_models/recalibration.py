@@ -1,9 +1,10 @@
 """Predictive intervals that hold what they promise on episodes the model was not trained on.
 
 A Gaussian fitted by likelihood matches the mean square of its residuals. Those of a robot that touches the ground have
-heavy tails, so the match is too wide for nine residuals in ten. One factor for each output mends that after training:
-it makes the central 90 % intervals hold nine in ten outcomes of validation episodes (split conformal prediction with
-normalised residuals: Papadopoulos et al. 2002, Lei et al. 2018), whatever the residuals' distribution.
+heavy tails, so the match is too wide for nine residuals in ten. Two numbers for each output mend that after training:
+a factor makes the central 90 % intervals hold nine in ten outcomes of validation episodes (split conformal prediction
+with normalised residuals: Papadopoulos et al. 2002, Lei et al. 2018), whatever the residuals' distribution, and a tail
+(`tails`) makes the 50 % intervals hold half of them.
 """
 
 import math
@@ -13,8 +14,9 @@ from torch import Tensor
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.world_models.horizon import Forecast, Trajectories
+from envtf_lit.world_models.tails import ANCHOR, LEAST, LEVEL, MOST, half_width, normal_score, stretch
 
-LEVEL = 0.9
+FEWEST = 9  # residuals that something is fitted to
 FACTORS = 1e-4, 1e4  # least and largest; constant dimensions have no residuals to speak of
 
 
@@ -29,19 +31,15 @@ def calibration_split(held_out: OfflineDataset) -> tuple[OfflineDataset | None, 
     return held_out.select(range(1, count, 2)), held_out.select(range(0, count, 2))
 
 
-def half_width(level: float) -> float:
-    """Standard deviations on either side of the mean that hold a share `level`, in (0, 1), of a Gaussian."""
-    return math.sqrt(2.0) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
+def normal_scores(taught: Forecast, trajectories: Trajectories) -> Tensor:
+    """(valid steps, S + 1) of the recorded outcomes, given a teacher-forced forecast; honest ones are standard normal.
 
-
-def standardised_residuals(taught: Forecast, trajectories: Trajectories) -> Tensor:
-    """(valid steps, S + 1) `(recorded - mean) / std` of a teacher-forced forecast; honest ones are standard normal.
-
-    A predicted std of zero gives infinity, or zero where the prediction is exact.
+    They are `(recorded - mean) / std` where the forecast is Gaussian. A predicted std of zero gives infinity, or zero
+    where the prediction is exact.
     """
     error = (trajectories.targets - taught.mean)[trajectories.valid].double()
-    std = taught.std[trajectories.valid].double()
-    return torch.where(error == 0.0, error, error / std)
+    z = torch.where(error == 0.0, error, error / taught.std[trajectories.valid].double())
+    return z if taught.tail is None else normal_score(z, taught.tail.double())
 
 
 def variance_factor(residuals: Tensor) -> Tensor:
@@ -51,9 +49,27 @@ def variance_factor(residuals: Tensor) -> Tensor:
         residuals: (n, K) standardised, of validation episodes. The bound is the `ceil(0.9 (n + 1))`-th smallest, which
             fewer than nine do not have: then nothing is changed.
     """
-    n, K = residuals.shape
-    rank = math.ceil(LEVEL * (n + 1))
-    if rank > n:
-        return torch.ones(K, dtype=residuals.dtype, device=residuals.device)
+    if len(residuals) < FEWEST:
+        return residuals.new_ones(residuals.shape[1])
+    rank = math.ceil(LEVEL * (len(residuals) + 1))
     bound = residuals.abs().kthvalue(rank, dim=0).values  # (K,)
-    return (bound / half_width(LEVEL)).square().nan_to_num(nan=FACTORS[1]).clamp(*FACTORS)
+    return (bound / ANCHOR).square().nan_to_num(nan=FACTORS[1]).clamp(*FACTORS)
+
+
+def fitted_tail(residuals: Tensor) -> Tensor:
+    """(K,) tails under which 50 % intervals hold half of the outcomes, from `LEAST` to `MOST`.
+
+    Args:
+        residuals: (n, K) standardised by a std whose 90 % intervals hold what they should. Fewer than nine are taken
+            for Gaussian.
+    """
+    least = residuals.new_full(residuals.shape[1:], LEAST)
+    if len(residuals) < FEWEST:
+        return torch.zeros_like(least)
+    most, middle = torch.full_like(least, MOST), torch.full_like(least, half_width(0.5))
+    median = residuals.abs().median(0).values
+    for _ in range(40):  # bisection: the heavier the tails, the narrower the middle
+        tail = 0.5 * (least + most)
+        light = stretch(middle, tail) > median  # not where the median is no number
+        least, most = torch.where(light, tail, least), torch.where(light, most, tail)
+    return least

@@ -20,7 +20,8 @@ from envtf_lit.world_models.interface import Mode, Prediction
 from envtf_lit.world_models.laplace import LastLayerLaplace, clusters
 from envtf_lit.world_models.normaliser import Normaliser
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
-from envtf_lit.world_models.recalibration import standardised_residuals, variance_factor
+from envtf_lit.world_models.recalibration import fitted_tail, normal_scores, variance_factor
+from envtf_lit.world_models.tails import log_density, stretch
 
 LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -14.0, 4.0
 LARGE_CACHE = 2**18  # numbers; beyond, a CPU takes the cache token by token, whose products then stay in its own caches
@@ -183,12 +184,14 @@ class EnvironmentTransformer(nn.Module):
     Attributes:
         recalibration: (S + 1,) factor of both predicted variances, one until `recalibrate`; the loss knows nothing of
             it.
+        tail: (S + 1,) of the predictive distributions, zero, as of Gaussians, until `recalibrate`.
 
     Raises:
         UserError: `heads` does not divide `width` into even parts, or `paper_mse` lacks its third head.
     """
 
     recalibration: Tensor
+    tail: Tensor
 
     def __init__(self, observation_dim: int, action_dim: int, **options: Any) -> None:
         super().__init__()
@@ -212,6 +215,7 @@ class EnvironmentTransformer(nn.Module):
         self.head = nn.Linear(width, (3 if self.has_epistemic_head else 2) * (observation_dim + 1))
         self.laplace = LastLayerLaplace(width, observation_dim + 1) if self.options.epistemic == "laplace" else None
         self.register_buffer("recalibration", torch.ones(observation_dim + 1))
+        self.register_buffer("tail", torch.zeros(observation_dim + 1))
         self.apply(_initialise)
         for block in self._stack():  # residual branches start small: sum of 2L terms keeps unit scale (GPT-2)
             for weight in (block.attention.out.weight, block.mlp[2].weight):
@@ -381,16 +385,19 @@ class EnvironmentTransformer(nn.Module):
         self.laplace.fit(hidden, target, mean, log_variance.exp(), groups)
 
     def recalibrate(self, trajectories: Trajectories) -> None:
-        """Fits `recalibration` to episodes kept out of training.
+        """Fits `recalibration` and `tail` to episodes kept out of training.
 
         Not of the paper's objective, whose collapsed variances are what it is there to show.
         """
         if self.options.objective == "paper_mse":
             return
         self.recalibration.fill_(1.0)
+        self.tail.zero_()
         trajectories = trajectories.to(self.recalibration.device)
-        taught = forecast(self, trajectories, feedback="recorded")
-        self.recalibration.copy_(variance_factor(standardised_residuals(taught, trajectories)))
+        residuals = normal_scores(forecast(self, trajectories, feedback="recorded"), trajectories)
+        factor = variance_factor(residuals)
+        self.recalibration.copy_(factor)
+        self.tail.copy_(fitted_tail(residuals / factor.sqrt()))
 
     def init(
         self,
@@ -492,7 +499,10 @@ class EnvironmentTransformer(nn.Module):
             deviation = self._posterior().deviation(hidden.float(), drawn)
             value, spread = mean + deviation * self.recalibration.sqrt(), aleatoric
         if mode == "sample":
-            value = value + spread.sqrt() * torch.empty_like(mean).normal_(generator=generator)
+            noise = stretch(torch.empty_like(mean).normal_(generator=generator), self.tail)
+            value = value + spread.sqrt() * noise
+        std = variance.sqrt()
+        density = log_density((value.detach() - mean) / std, self.tail) - (std * scale).log()  # of each output
         outcome = self.normaliser.outcome(observation, value)
         return Prediction(
             observation=outcome[..., :-1],
@@ -502,7 +512,8 @@ class EnvironmentTransformer(nn.Module):
             epistemic=None if epistemic is None else epistemic.sqrt() * scale,
             uncertainty=self.normaliser.uncertainty(variance),
             novelty=novelty,
-            log_prob=-nll(mean, variance.log(), value.detach()) - scale.log().sum(),
+            log_prob=density.sum(-1),
+            tail=self.tail,
         )
 
     def observe(self, state: TransformerState, observation: Tensor) -> TransformerState:
