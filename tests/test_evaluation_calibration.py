@@ -224,6 +224,10 @@ class TrueWorld:
         following[np.abs(observations).max(1) > self.limit] = np.nan
         return following, np.zeros(len(state)), np.zeros(len(state), bool)
 
+    def depth(self, observations: np.ndarray) -> np.ndarray:
+        """As if the first column were the height."""
+        return np.maximum(0.0, -observations[:, 0])
+
 
 class Still:
     """No action."""
@@ -238,6 +242,7 @@ def test_errors_are_those_of_each_step_from_the_imagined_state():
     starts, scale = draw_points(data, 6, history=2, seed=0), Scale.of(data)
     run = rollout_errors(model, Still(), starts, TrueWorld(linear_world()), scale, steps=4)  # pyright: ignore
     state, expected = starts.observations[torch.arange(6), starts.lengths - 1], []
+    first = state[:, 0]
     for _ in range(4):
         imagined, true = state @ model.matrix.T, state @ linear_world().matrix.T
         error = ((imagined - true)[:, :2] / scale.std[:2]).square().mean(1).sqrt()  # the third never moves
@@ -245,6 +250,7 @@ def test_errors_are_those_of_each_step_from_the_imagined_state():
         state = imagined
     np.testing.assert_allclose(run.error, torch.cat(expected).numpy(), rtol=1e-4)
     assert (run.uncertainty == pytest.approx(0.3)) and run.given_up == 0.0
+    assert run.depth[:6] == pytest.approx(first.clamp(max=0.0).abs().numpy()) and (run.depth > 0.0).any()
 
 
 def test_what_the_simulator_cannot_take_is_left_out_and_counted():

@@ -147,6 +147,20 @@ def test_an_orientation_need_not_be_a_unit_quaternion() -> None:
         np.testing.assert_allclose(a, b, atol=1e-9)
 
 
+@pytest.mark.parametrize(("name", "height"), [("ant", 0), ("hopper", 0), ("halfcheetah", 0)])
+def test_depth_is_how_far_a_body_stands_in_the_ground(name: str, height: int) -> None:
+    rows, physics = recorded(name), Physics(ROBOTS[name])
+    real = physics.depth(rows.observations)
+    assert (real >= 0.0).all() and real.max() < 0.1  # contacts are soft
+    raised, sunk = rows.observations[:20].copy(), rows.observations[:20].copy()
+    raised[:, height] += 3.0
+    sunk[:, height] -= 3.0
+    assert (physics.depth(raised) == 0.0).all()
+    deeper = sunk.copy()
+    deeper[:, height] -= 0.5
+    np.testing.assert_allclose(physics.depth(deeper) - physics.depth(sunk), 0.5, atol=1e-9)
+
+
 def test_contact_forces_in_the_observation_are_no_state() -> None:
     robot, rows = get_task("ant-medium-105d").robot, recorded("ant")
     wide = np.column_stack([rows.observations[:5], np.full((5, 78), 3.0)])

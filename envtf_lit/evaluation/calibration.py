@@ -192,6 +192,7 @@ class RolloutErrors:
         uncertainty: (M,) the model's u of the step.
         error: (M,) root mean square over live observation dimensions of (imagined - true next observation), in
             standard deviations of the training data.
+        depth: (M,) metres by which the body stood in the ground where the step began (`Physics.depth`).
         given_up: share of the steps whose state the simulator could not take; they are left out.
         clipped: share of the steps, those aside, that begin where the observation clips a velocity, so that a restart
             there tells nothing of the truth; they are left out, too.
@@ -199,6 +200,7 @@ class RolloutErrors:
 
     uncertainty: np.ndarray
     error: np.ndarray
+    depth: np.ndarray
     given_up: float
     clipped: float
 
@@ -217,12 +219,13 @@ def rollout_errors(
         steps: of each rollout, at most.
     """
     run = imagine(model, policy, starts.starts, horizon=0, tail=steps, terminated=physics.robot.terminated)
-    imagined = run.next_observations.double().cpu().numpy()
-    true, _, _ = physics.step(run.observations.double().cpu().numpy(), run.actions.cpu().numpy())
+    begun, imagined = (x.double().cpu().numpy() for x in (run.observations, run.next_observations))
+    true, _, _ = physics.step(begun, run.actions.cpu().numpy())
     live, std = scale.live[:-1].cpu().numpy(), scale.std[:-1].double().cpu().numpy()
     error = np.sqrt(np.square((imagined - true)[:, live] / std[live]).mean(1))
     uncertainty = run.uncertainty.double().cpu().numpy()
     finite = np.isfinite(error) & np.isfinite(uncertainty)
     clipped = finite & physics.robot.clipped(run.observations).cpu().numpy()
     kept = finite & ~clipped
-    return RolloutErrors(uncertainty[kept], error[kept], float(1.0 - finite.mean()), float(clipped.mean()))
+    depth = physics.depth(begun[kept])
+    return RolloutErrors(uncertainty[kept], error[kept], depth, float(1.0 - finite.mean()), float(clipped.mean()))

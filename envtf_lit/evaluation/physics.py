@@ -100,6 +100,19 @@ class Physics:
                         break
         return outcomes
 
+    def depth(self, observations: np.ndarray) -> np.ndarray:
+        """(B,) float64, how many metres the body stands in the ground, at most; 0 where it does not.
+
+        Contacts are soft, so that real robots sink in by millimetres or centimetres. An imagined state may be far
+        below, where a restart throws the robot out: no real motion begins there.
+        """
+        depths = np.zeros(len(observations))
+        with quiet_mujoco():
+            for row, observation in enumerate(observations):
+                self._restart(observation)
+                depths[row] = max((-contact.dist for contact in self._env.data.contact), default=0.0)
+        return depths.clip(min=0.0)
+
     def _check(self, observations: Any, actions: Any) -> None:
         found, expected = (observations.shape[1], actions.shape[1]), (self.robot.observation_dim, self.robot.action_dim)
         if found != expected:

@@ -67,8 +67,11 @@ class Attention(nn.Module):
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
         """Whole sequences (B, H, T, d); `mask` None means plain causal attention."""
-        if q.device.type == "cpu":  # torch's fused kernel there has a bf16 backward pass five to eight times slower
-            y = self._products(q, k, v, window_mask(T := q.shape[2], T, q.device) if mask is None else mask)
+        T = q.shape[2]
+        # torch's fused kernel has a bf16 backward pass five to eight times slower on a CPU, and on a GPU, for sequences
+        # of one token, one that doubles the time of the whole step
+        if q.device.type == "cpu" or T == 1:
+            y = self._products(q, k, v, window_mask(T, T, q.device) if mask is None else mask)
         else:
             dropout = self.dropout if self.training else 0.0
             y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=mask is None, dropout_p=dropout)
