@@ -152,6 +152,7 @@ def measure(
     """
     course = cache(partial(Course, task, suite, options, progress))
     settings = flat_settings(task.tier, suite.options, calibration=options)
+    settings["own_rollouts"] = "above the ground"  # results without that are older
 
     def one(folder: Path) -> dict[str, Any]:
         place = course()

@@ -179,7 +179,7 @@ class _Course:
             raise UserError(
                 f"No episode of {task.name} lasts longer than {self.start} steps: start earlier, or take more episodes."
             )
-        self.key["explosions"] = "before the fall, too"  # results without them are older
+        self.key["explosions"] = "before the fall and of physics, too"  # results without them are older
         self.scale, self.physics = Scale.of(suite.split()[0], self.device), Physics(task.robot)
 
     def _fresh(self, file: Path, task: Task, count: int, *, workers: int, progress: bool) -> Trajectories:
@@ -212,7 +212,8 @@ class _Course:
         return self._kept(name, [folder], work)
 
     def _ceiling(self, name: str, size: float) -> Tracking:
-        return track_ceiling(name, ceiling(self.physics, self.trajectories[RECORDED], self.scale, size, seed=self.seed))
+        found = ceiling(self.physics, self.trajectories[RECORDED], self.scale, size, seed=self.seed)
+        return track_ceiling(name, found, self.robot.terminated)
 
     def _kept(self, name: str, inputs: list[Path], work: Callable[[], dict[str, Tracking]]) -> dict[str, Tracking]:
         """Results of the work, now or when it was done on the same inputs."""
@@ -257,6 +258,7 @@ def page(found: Mapping[str, Results], tier: str) -> str:
 OFFLINE_HEAD = (
     "robot", "model", "one-step error (typical)", "open loop 0.01", "ceiling 0.01 (typical)", "open loop 0.1",
     "ceiling 0.1 (typical)", "sampled 0.1", "teacher-forced 0.01", "censored 0.1", "exploded (standing)",
+    "physics exploded (typical)",
 )  # fmt: skip
 ONLINE_HEAD = ("robot", "model", "policy", "open loop 0.01", "open loop 0.1", "censored 0.1", "exploded")
 
@@ -281,6 +283,7 @@ def _offline_row(robot: str, model: str, numbers: Mapping[str, float]) -> tuple[
         _steps(numbers, "teacher_forced_0.01"),
         f"{numbers['open_loop_0.1_censored']:.0%}",
         f"{numbers['explosion_rate']:.1%} ({numbers['explosion_rate_standing']:.1%})",
+        f"{numbers['ceiling_explosion_rate']:.1%} ({numbers['ceiling_typical_explosion_rate']:.1%})",
     )
 
 

@@ -122,7 +122,7 @@ def test_ceilings_leave_out_trajectories_that_start_at_a_clipped_state() -> None
     partly = next(late for late in starts if 0 < int(robot.clipped(late.observations[:, 0]).sum()) < len(late.lengths))
     clear = ~robot.clipped(partly.observations[:, 0])
     found = ceiling(Physics(robot), partly, scale, 0.0, seed=0)
-    assert torch.equal(found.lengths, partly.lengths[clear]) and len(found.error) == int(clear.sum())
+    assert torch.equal(found.trajectories.lengths, partly.lengths[clear]) and len(found.error) == int(clear.sum())
     assert found.steps[0.1].censored == 1.0  # an undisturbed replay is the record
     with pytest.raises(UserError, match="Every trajectory of walker2d begins with a velocity that its observation"):
         ceiling(Physics(robot), partly.select(~clear), scale, 0.0, seed=0)

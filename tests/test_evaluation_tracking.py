@@ -85,11 +85,16 @@ def test_drawn_rollouts_leave_the_record_sooner_and_have_a_seed() -> None:
 
 
 def test_a_ceiling_has_numbers_and_a_curve_of_its_name() -> None:
-    error = torch.tensor([[0.0, 0.05, torch.inf]] * 5)
-    lengths = torch.full((5,), 3)
-    found = track_ceiling("most", Ceiling(0.1, {0.01: Steps.within(error, lengths, 0.01)}, error, lengths))
+    error = torch.tensor([[0.0, 0.05, torch.inf]] * 4 + [[0.0, 0.05, 0.06]])
+    trajectories = whole_episodes(linear_data((3,) * 5), 5, seed=0)
+    outcomes = torch.zeros(5, 3, 4)
+    outcomes[0, 1:, 0] = outcomes[1, 2:, 0] = outcomes[4, :, 0] = -1.0  # falls, the last one without exploding
+    run = Ceiling(0.1, {0.01: Steps.within(error, trajectories.lengths, 0.01)}, trajectories, outcomes, error)
+    found = track_ceiling("most", run, lambda states: states[..., 0] < 0.0)
     assert found.numbers["most_0.01"] == 1.0 and found.numbers["most_0.01_censored"] == 0.0
     assert found.curves["most"]["median"] == pytest.approx([1e-8, 0.05, 1e8])
+    assert found.numbers["most_explosion_rate"] == pytest.approx(0.8)
+    assert found.numbers["most_explosion_rate_standing"] == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize(("task", "count"), [(Task(BRIEF_HOPPER, "expert"), 12), (get_task("walker2d-random"), 40)])

@@ -23,7 +23,14 @@ ENSEMBLE = EnsembleOptions(
     members=2, elites=1, hidden=(8,), weight_decay=(0.0, 0.0), updates=2, updates_per_epoch=2, batch_size=8
 )
 TINY = SuiteOptions(transitions=1_000, updates=2, context=8, ensemble=ENSEMBLE, threads=1)
-PROMISED = ("open_loop_0.01", "open_loop_0.1", "teacher_forced_0.01", "explosion_rate", "ceiling_0.01")
+PROMISED = (
+    "open_loop_0.01",
+    "open_loop_0.1",
+    "teacher_forced_0.01",
+    "explosion_rate",
+    "ceiling_0.01",
+    "ceiling_explosion_rate",
+)
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from envtf_lit.errors import UserError
 from envtf_lit.tasks import ROBOTS, Robot, quiet_mujoco
-from envtf_lit.world_models.horizon import THRESHOLDS, Scale, Steps, Trajectories, nmse
+from envtf_lit.world_models.horizon import EXPLODED, THRESHOLDS, Scale, Steps, Trajectories, nmse
 
 # after these MuJoCo goes on from its initial state
 GIVEN_UP = [int(getattr(mujoco.mjtWarning, f"mjWARN_BADQ{kind}")) for kind in ("POS", "VEL", "ACC")]  # pyright: ignore
@@ -156,14 +156,16 @@ class Ceiling:
     Attributes:
         size: of the disturbance, in standard deviations of each live dimension.
         steps: by threshold.
-        error: (B, T) nmse of the replays, infinite where one has passed the largest threshold.
-        lengths: (B,) valid steps.
+        trajectories: B that were replayed.
+        outcomes: (B, T, S + 1) what happened instead, infinite once a replay has exploded.
+        error: (B, T) its nmse.
     """
 
     size: float
     steps: dict[float, Steps]
+    trajectories: Trajectories
+    outcomes: Tensor
     error: Tensor
-    lengths: Tensor
 
 
 def ceiling(
@@ -196,6 +198,7 @@ def ceiling(
             "them, or let them start earlier."
         )
     starts = perturbed(trajectories, scale, size, seed=seed)
-    outcomes = physics.replay(trajectories, starts, scale, beyond=max(thresholds)).to(trajectories.targets.device)
-    error, lengths = nmse(outcomes, trajectories, scale), trajectories.lengths
-    return Ceiling(size, {t: Steps.within(error, lengths, t) for t in thresholds}, error, lengths)
+    outcomes = physics.replay(trajectories, starts, scale, beyond=EXPLODED).to(trajectories.targets.device)
+    error = nmse(outcomes, trajectories, scale)
+    steps = {threshold: Steps.within(error, trajectories.lengths, threshold) for threshold in thresholds}
+    return Ceiling(size, steps, trajectories, outcomes, error)

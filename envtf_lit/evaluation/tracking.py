@@ -20,7 +20,6 @@ from envtf_lit.world_models.horizon import (
     EXPLODED,
     LARGEST,
     THRESHOLDS,
-    HorizonReport,
     Scale,
     Steps,
     Trajectories,
@@ -94,7 +93,9 @@ def track(
         "one_step_nrmse": math.sqrt(min(report.nmse_one_step, LARGEST)),
         "one_step_typical": math.sqrt(min(float(taught[trajectories.valid].median()), LARGEST)),
         "explosion_rate": report.explosion_rate,
-        "explosion_rate_standing": _exploded_standing(report, terminated),
+        "explosion_rate_standing": _exploded_standing(
+            report.open_loop_nmse, trajectories, report.imagined.mean, terminated
+        ),
         **_numbers("open_loop", report.open_loop),
         **_numbers("teacher_forced", report.teacher_forced),
         **{f"open_loop_nmse_at_{h}": min(value, LARGEST) for h, value in report.median_nmse.items()},
@@ -103,10 +104,12 @@ def track(
     return Tracking(numbers, {run: _curve(error, lengths) for run, error in errors.items()})
 
 
-def _exploded_standing(report: HorizonReport, terminated: Callable[[Tensor], Tensor]) -> float:
-    """Share of trajectories that explode before the model's own robot falls, where imagination would end them."""
-    fallen = terminated(report.imagined.mean[..., :-1]).int().cummax(1).values.bool()  # (B, T)
-    exploded = (report.open_loop_nmse > EXPLODED) & report.trajectories.valid & ~fallen
+def _exploded_standing(
+    error: Tensor, trajectories: Trajectories, outcomes: Tensor, terminated: Callable[[Tensor], Tensor]
+) -> float:
+    """Share of trajectories that explode before the robot of these outcomes falls, where imagination would end them."""
+    fallen = terminated(outcomes[..., :-1]).int().cummax(1).values.bool()  # (B, T)
+    exploded = (error > EXPLODED) & trajectories.valid & ~fallen
     return float(exploded.any(1).double().mean())
 
 
@@ -119,9 +122,15 @@ def track_sampled(model: WorldModel, trajectories: Trajectories, scale: Scale, *
     return Tracking(_numbers("sampled_open_loop", found))
 
 
-def track_ceiling(name: str, found: Ceiling) -> Tracking:
-    """A physics ceiling as numbers and a curve of that name."""
-    return Tracking(_numbers(name, found.steps), {name: _curve(found.error, found.lengths)})
+def track_ceiling(name: str, found: Ceiling, terminated: Callable[[Tensor], Tensor] = never_terminated) -> Tracking:
+    """A physics ceiling as numbers and a curve of that name; `terminated` is the robot's rule, as in `track`."""
+    error, trajectories = found.error, found.trajectories
+    exploded = ((error > EXPLODED) & trajectories.valid).any(1)
+    numbers = _numbers(name, found.steps) | {
+        f"{name}_explosion_rate": float(exploded.double().mean()),
+        f"{name}_explosion_rate_standing": _exploded_standing(error, trajectories, found.outcomes, terminated),
+    }
+    return Tracking(numbers, {name: _curve(error, trajectories.lengths)})
 
 
 def _numbers(name: str, by_threshold: Mapping[float, Steps]) -> dict[str, float]:
