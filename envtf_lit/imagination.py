@@ -35,7 +35,7 @@ class Rollouts:
         rewards: (M,), without any penalty.
         terminated: (M,) bool, by the robot's rule.
         halted: (M,) bool, where the rollout was given up because the model had left what it knows.
-        aleatoric: (M, S + 1) predicted standard deviation of (next observation, reward).
+        aleatoric: (M, S + 1) predicted spread of (next observation, reward), as `Prediction.aleatoric`.
         uncertainty: (M,) `Prediction.uncertainty` of each transition.
         branch: (M,) which rollout; step: (M,) how many imagined steps came before.
     """

@@ -93,10 +93,10 @@ class Suite:
         kinds = {"train_seconds": self.seconds, "updates": self.updates}
         return {f"{self.robot.name}.{name}.{kind}": value for kind, by in kinds.items() for name, value in by.items()}
 
-    def split(self) -> tuple[OfflineDataset, OfflineDataset]:
-        """The episodes that every model was trained on, and those that none was trained or calibrated on."""
+    def split(self) -> tuple[OfflineDataset, OfflineDataset | None, OfflineDataset]:
+        """The episodes that every model was trained on, calibrated on (if there are any), and neither."""
         training, held_out = load_dataset(self.dataset).split(TrainModelOptions().held_out, seed=self.options.seed)
-        return training, calibration_split(held_out)[1]
+        return training, *calibration_split(held_out)
 
 
 def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from envtf_lit.evaluation.calibration import (
     novelties,
     proper_scores,
     rank_correlation,
+    recalibrated,
     roc_curve,
     rollout_errors,
     with_uniform_actions,
@@ -95,6 +96,25 @@ def test_the_ranked_score_is_the_integral_that_it_stands_for():
             below = 0.5 * torch.erfc(torch.from_numpy((m - grid) / s / np.sqrt(2.0))).numpy()
             expected.append(np.trapezoid(np.square(below - (grid >= y)), grid))
     assert proper_scores(taught, trajectories, scale).crps == pytest.approx(np.mean(expected), rel=1e-3)
+
+
+def test_recalibration_mends_a_wrong_spread_and_leaves_a_fitted_one():
+    halves = [whole_episodes(linear_data((300,) * 6, noise=NOISE, seed=seed), 6, seed=0) for seed in (1, 2)]
+    timid = linear_world(std=3 * NOISE)
+    seen, taught = (forecast(timid, half, feedback="recorded") for half in halves)
+    scale = Scale.of(linear_data((300,) * 6, noise=NOISE))
+    mended = recalibrated(taught, seen, halves[0])
+    assert coverage(taught, halves[1], scale, 0.5).mean > 0.9
+    for level in (0.5, 0.9):
+        assert coverage(mended, halves[1], scale, level).mean == pytest.approx(level, abs=0.03)
+    before, after = (proper_scores(run, halves[1], scale) for run in (taught, mended))
+    assert after.nll < before.nll and after.crps < before.crps
+    seen_mended = recalibrated(seen, seen, halves[0])
+    again = recalibrated(mended, seen_mended, halves[0])
+    live = scale.live  # a dimension without errors has no spread to speak of
+    torch.testing.assert_close(again.std[..., live], mended.std[..., live], rtol=1e-3, atol=0)
+    assert again.tail is not None and mended.tail is not None
+    torch.testing.assert_close(again.tail[live], mended.tail[live], rtol=1e-2, atol=1e-3)
 
 
 def test_certain_and_infinite_forecasts_have_finite_scores(data):

@@ -161,6 +161,12 @@ def test_depth_is_how_far_a_body_stands_in_the_ground(name: str, height: int) ->
     np.testing.assert_allclose(physics.depth(deeper) - physics.depth(sunk), 0.5, atol=1e-9)
 
 
+def test_a_folded_robot_in_the_air_stands_in_nothing() -> None:
+    folded = np.zeros((1, 11))
+    folded[0, :4] = 4.0, 0.0, -2.5, -2.5  # height, and the joints of thigh and leg: hopper's own parts do collide
+    assert Physics(ROBOTS["hopper"]).depth(folded).tolist() == [0.0]
+
+
 def test_contact_forces_in_the_observation_are_no_state() -> None:
     robot, rows = get_task("ant-medium-105d").robot, recorded("ant")
     wide = np.column_stack([rows.observations[:5], np.full((5, 78), 3.0)])

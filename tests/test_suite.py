@@ -33,7 +33,7 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(
     assert isinstance(transformer, EnvironmentTransformer) and transformer.options.context > 1
     assert isinstance(context_1, EnvironmentTransformer) and context_1.options.context == 1
     assert isinstance(ensemble, EnsembleDynamics) and ensemble.members == 3
-    training, held_out = suite.split()
+    training, _, held_out = suite.split()
     assert len(training) > 500 and len(held_out) > 0
 
     written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}

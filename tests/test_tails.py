@@ -76,3 +76,12 @@ def test_an_infinite_outcome_scores_infinitely_badly():
     z, tail = torch.tensor([math.inf]), torch.tensor([0.5])
     assert float(log_density(z, tail)) == -math.inf
     assert float(crps(z, tail)) == math.inf
+
+
+@pytest.mark.parametrize("outcome", [0.0, 1e-3, 2.0, 1e10])
+def test_densities_have_the_gradients_of_finite_differences(outcome: float) -> None:
+    z = torch.tensor([outcome], dtype=torch.float64, requires_grad=True)
+    step = 1e-6 * max(1.0, outcome)
+    (found,) = torch.autograd.grad(log_density(z, tail_of(0.7)).sum(), z)
+    after, before = (log_density(z.detach() + move, tail_of(0.7)) for move in (step, -step))
+    assert float(found) == pytest.approx(float(after - before) / (2 * step), rel=1e-4, abs=1e-8)

@@ -1,7 +1,7 @@
 """`envtf bench model`: how fast a world model imagines and learns, beside what it would replace.
 
 Every ratio compares two sides that take turns in one process on one machine, in the same precision. Weights are random:
-they do not change the work.
+they do not change the work. Predictive distributions have tails, as those of trained models do.
 """
 
 import multiprocessing
@@ -31,6 +31,7 @@ from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 SHARE = GenerateRolloutsOptions().share  # rollouts that begin in one window
 UNCACHED_CONTEXT = 32  # at which the cache is measured
+TAIL = 0.6  # of every output, a usual one
 CHUNK = 512  # windows that the model without its cache takes at a time
 MATMUL = {"cpu": (2_048, 3)}  # size and number of the products that give the peak; elsewhere:
 MATMUL_ACCELERATOR = 8_192, 20
@@ -199,6 +200,8 @@ def _shared_histories(robot: Robot, batch: int, length: int, device: torch.devic
 
 
 def _frozen(model: Any, device: torch.device, compile: bool) -> Any:
+    if isinstance(model, EnvironmentTransformer):
+        model.tail.fill_(TAIL)
     if compile:
         model.fuse()
     return model.to(device).eval().requires_grad_(False)

@@ -101,17 +101,18 @@ class Physics:
         return outcomes
 
     def depth(self, observations: np.ndarray) -> np.ndarray:
-        """(B,) float64, how many metres the body stands in the ground, at most; 0 where it does not.
+        """(B,) float64, how many metres of the body stand in the ground, at most; 0 where none does.
 
         Contacts are soft, so that real robots sink in by millimetres or centimetres. An imagined state may be far
         below, where a restart throws the robot out: no real motion begins there.
         """
-        depths = np.zeros(len(observations))
+        depths, ground = np.zeros(len(observations)), self._env.model.geom_bodyid == 0  # what belongs to the world
         with quiet_mujoco():
             for row, observation in enumerate(observations):
                 self._restart(observation)
-                depths[row] = max((-contact.dist for contact in self._env.data.contact), default=0.0)
-        return depths.clip(min=0.0)
+                contact = self._env.data.contact
+                depths[row] = -contact.dist[ground[contact.geom].any(1)].min(initial=0.0)
+        return depths
 
     def _check(self, observations: Any, actions: Any) -> None:
         found, expected = (observations.shape[1], actions.shape[1]), (self.robot.observation_dim, self.robot.action_dim)

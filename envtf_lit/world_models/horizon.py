@@ -125,7 +125,8 @@ class Forecast:
 
     Attributes:
         mean: (B, T, S + 1) of the next observation and, last, the reward; their draws, if sampled.
-        std: (B, T, S + 1), `sqrt(aleatoric^2 + epistemic^2)`, of that one step given the state it started from.
+        std: (B, T, S + 1), `sqrt(aleatoric^2 + epistemic^2)`, of that one step given the state it started from; with a
+            tail, of the Gaussian that has the same 90 % interval.
         tail: (S + 1,) of the predictive distributions (`world_models.tails`); None: they are Gaussian.
     """
 

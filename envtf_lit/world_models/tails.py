@@ -35,14 +35,14 @@ def stretch(score: Tensor, tail: Tensor) -> Tensor:
 def normal_score(z: Tensor, tail: Tensor) -> Tensor:
     """The inverse of `stretch`: what honest outcomes, `z = (outcome - mean) / std`, make standard normal."""
     tail = tail.clamp(min=LEAST)
-    return torch.asinh(_slope(tail) * z) / tail
+    return _asinh(_slope(tail) * z) / tail
 
 
 def log_density(z: Tensor, tail: Tensor) -> Tensor:
     """Of outcomes z (..., K), in units of std, each under its own tail (K,): (..., K)."""
     tail = tail.clamp(min=LEAST)
     slope = _slope(tail)
-    score = torch.asinh(slope * z) / tail
+    score = _asinh(slope * z) / tail
     return (slope / tail).log() - 0.5 * (score.square() + (slope * z).square().log1p() + math.log(2.0 * math.pi))
 
 
@@ -56,6 +56,13 @@ def crps(z: Tensor, tail: Tensor) -> Tensor:
     score, unit = normal_score(z, tail), torch.exp(0.5 * tail.square()) / _slope(tail)
     error = z * (2.0 * _below(score) - 1.0) + unit * (_below(tail - score) - _below(-tail - score))
     return error - unit * torch.erf(0.5 * tail)
+
+
+def _asinh(x: Tensor) -> Tensor:
+    """As accurate as torch's, whose CPU kernel takes four times as long."""
+    size = x.abs()
+    finite = size.clamp(max=1e18)  # its square is a float32
+    return torch.copysign((size + size * (finite / (1.0 + (1.0 + finite.square()).sqrt()))).log1p(), x)
 
 
 def _slope(tail: Tensor) -> Tensor:

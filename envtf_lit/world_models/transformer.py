@@ -238,7 +238,7 @@ class EnvironmentTransformer(nn.Module):
 
         The blocks must be alike. A projection of the same dimensions is taken over too, rescaled so that in the data's
         own units the model predicts what the other does (variances as far as their bounds let them); others, such as
-        those of another robot, begin anew. So do posterior and recalibration.
+        those of another robot, begin anew. So do posterior, recalibration and tail.
 
         Raises:
             UserError: the two differ in what the weights mean.
@@ -484,7 +484,8 @@ class EnvironmentTransformer(nn.Module):
     ) -> Prediction:
         """Last hidden tokens (..., D) and current observations (..., S) to a `Prediction` in the data's units.
 
-        With drawn last layers (B, D + 1, S + 1) outcomes follow those, and differ by aleatoric noise alone.
+        With drawn last layers (B, D + 1, S + 1) outcomes follow those, and differ by aleatoric noise alone; `log_prob`
+        is under the whole distribution nevertheless.
         """
         scale = self.normaliser.target_std
         mean, log_variance, epistemic_log_variance = self.heads(hidden)
