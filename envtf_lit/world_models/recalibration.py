@@ -4,7 +4,7 @@ A Gaussian fitted by likelihood matches the mean square of its residuals. Those 
 heavy tails, so the match is too wide for nine residuals in ten. Two numbers for each output mend that after training:
 a factor makes the central 90 % intervals hold nine in ten outcomes of validation episodes, and a tail (`tails`) makes
 the 50 % intervals hold half of them. The factor is that of split conformal prediction with normalised residuals
-(Papadopoulos et al. 2002, Lei et al. 2018), whose guarantee asks for more than steps of one episode have: exchangeability.
+(Papadopoulos et al. 2002, Lei et al. 2018), whose guarantee asks for exchangeable residuals, unlike steps.
 """
 
 import math
