@@ -39,7 +39,7 @@ def calibration_page(curves: Mapping[str, Mapping[str, Mapping[str, Columns]]], 
             row[0].set_ylabel(f"{robot}\n{row[0].get_ylabel()}")
         for axis, title in zip(axes[0], TITLES.values(), strict=True):
             axis.set_title(title, fontsize="medium")
-        axes[0, -1].legend(loc="lower right", fontsize="small")
+        axes[0, 2].legend(loc="lower right", fontsize="small")  # where curves run along the top
         figure.suptitle("Does the model know what it does not know?")
     write_table(path, _long(curves))
     return Path(path)
