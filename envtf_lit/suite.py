@@ -35,6 +35,7 @@ MODELS = ("transformer", "context_1", "ensemble")  # their names in every table,
 PHYSICS = "physics"  # what stands beside them under that name, so that no other model may have it
 WORDS = ("trained_with", "note")  # of a dataset's origin: about the whole series, of which a tier may use a part
 SHARED = ("seed", "threads", "precision", "compile")  # options that a suite has in common with `Params`
+FORMAT = 2  # of saved transformers; those of before cannot be read and are trained anew
 WORK = Path(".envtf/suite")  # where suites are kept unless told otherwise
 
 
@@ -221,6 +222,7 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
     params = replace(Params(), task=suite.task, train_model=options, **_common(shared))
     key = {"task": suite.task, "transitions": shared.transitions, **{name: getattr(shared, name) for name in SHARED}}
     key |= {"train_model": _plain(asdict(options)), "dataset": sha256(suite.dataset)}
+    key |= {"format": FORMAT} if options.ensemble is None else {}
     suite.folders[name] = home / "models" / name
     train = partial(_train, params, suite.dataset, suite.folders[name], home, progress)
     record = home / "models" / f"{name}.json"

@@ -63,6 +63,12 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(
     build_suite("hopper-medium", tmp_path, replace(changed, updates=3, context=2), models=["ensemble"], progress=False)
     assert trained.stat().st_mtime_ns == time  # the others' budgets are not its own
 
+    old = json.loads(record.read_text())
+    del old["settings"]["format"]  # as if written when transformers were saved otherwise
+    record.write_text(json.dumps(old))
+    build_suite("hopper-medium", tmp_path, TINY, models=["transformer"], progress=False)
+    assert (suite.folders["transformer"] / "weights.safetensors").stat().st_mtime_ns > time
+
     calls = list[str]()
     monkeypatch.setattr(suite_module.pipeline, "download", lambda *arguments, **options: calls.append("data"))
     monkeypatch.setattr(suite_module, "_train", lambda *arguments: calls.append("model"))
