@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from matplotlib.axes import Axes
 from PIL import Image
 
 from envtf_lit import horizon, tasks
@@ -14,6 +15,8 @@ from envtf_lit.cli import main
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation import tracking
 from envtf_lit.evaluation.tracking import fresh_episodes
+from envtf_lit.figures import horizons
+from envtf_lit.figures.style import LABELS
 from envtf_lit.horizon import ONLINE, SIZES, HorizonOptions, compare
 from envtf_lit.params import EnsembleOptions
 from envtf_lit.suite import MODELS, Suite, SuiteOptions, build_suite
@@ -135,3 +138,17 @@ def test_a_model_needs_a_name_and_a_folder(tmp_path: Path, capsys: pytest.Captur
         main([command, "--out", str(tmp_path / "out.json"), "--model", "rambo"])
     assert stop.value.code == 2
     assert "write --model NAME=FOLDER" in capsys.readouterr().err
+
+
+def test_the_legend_names_the_models_of_all_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = pd.DataFrame(
+        [
+            dict(robot=robot, model=model, run="open_loop", step=h, lower=0.1, median=0.2, upper=0.3, trajectories=9)
+            for robot, model in (("hopper", "transformer"), ("hopper", "context_1"), ("ant", "transformer"))
+            for h in (1, 2)
+        ]
+    )
+    shown = list[str]()
+    monkeypatch.setattr(Axes, "legend", lambda axis, handles, labels, **looks: shown.extend(labels))
+    horizons.error_growth(table, "open_loop", tmp_path / "growth.png")
+    assert shown == [LABELS["transformer"], LABELS["context_1"]]

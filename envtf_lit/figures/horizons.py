@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
@@ -30,7 +31,7 @@ def error_growth(curves: pd.DataFrame, run: str, path: str | Path) -> Path:
             _panel(axis, shown.query("robot == @robot"), looks)
             axis.set(title=robot, xlabel="step h")
         axes[0, 0].set_ylabel("normalised squared error")
-        _legend(axes[0, -1])
+        _legend(axes[0, -1], axes)
         words = "open loop, fed its own predictions" if run == "open_loop" else "teacher-forced, shown the true past"
         figure.suptitle(f"Error on recorded actions:\n{words} (median, quartiles)")
     write_table(path, shown)
@@ -55,7 +56,7 @@ def online_growth(curves: pd.DataFrame, path: str | Path) -> Path:
             row[0].set_ylabel("normalised squared error")
         for axis in axes[-1]:
             axis.set_xlabel("step h")
-        _legend(next(axis for axis in axes[:, -1] if axis.lines))
+        _legend(next(axis for axis in axes[:, -1] if axis.lines), axes)
         figure.suptitle("Error on the actions of policies that drive MuJoCo:\nopen loop (median, quartiles)")
     write_table(path, shown)
     return Path(path)
@@ -90,7 +91,7 @@ def steps_against_ceiling(lengths: pd.DataFrame, path: str | Path) -> Path:
             row[0].set_ylabel("steps")
         for axis in axes[-1]:
             axis.set_xlabel("typical one-step error (std)")
-        _legend(axes[0, -1])
+        _legend(axes[0, -1], axes)
         figure.suptitle(
             "Steps within a threshold, open loop, and what\nphysics reaches if its start is off by the same error"
         )
@@ -121,5 +122,7 @@ def _panel(axis: Axes, curves: pd.DataFrame, looks: dict[str, Look]) -> None:
     axis.set_ylim(max(low, LOWEST), min(high, HIGHEST))
 
 
-def _legend(axis: Axes) -> None:
-    axis.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
+def _legend(axis: Axes, axes: np.ndarray) -> None:
+    """Beside one axis, of all that any of the axes shows: robots need not have the same models."""
+    shown = {label: line for each in axes.flat for line, label in zip(*each.get_legend_handles_labels(), strict=True)}
+    axis.legend(shown.values(), shown.keys(), fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
