@@ -21,7 +21,7 @@ from envtf_lit.policy import Policy
 from envtf_lit.world_models.horizon import LARGEST, Forecast, Scale, Trajectories
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.normaliser import CONSTANT
-from envtf_lit.world_models.recalibration import fitted_tail, normal_scores, variance_factor
+from envtf_lit.world_models.recalibration import fitted, normal_scores
 from envtf_lit.world_models.tails import crps, half_width, log_density
 
 FIRST_STEPS = 10  # of an episode: just after a reset robots are where they hardly ever are again
@@ -65,9 +65,8 @@ def recalibrated(taught: Forecast, seen: Forecast, trajectories: Trajectories) -
         seen: what factors and tails are fitted to, of other episodes.
         trajectories: what happened in these.
     """
-    residuals = normal_scores(replace(seen, tail=None), trajectories)
-    std = variance_factor(residuals).sqrt()
-    return Forecast(taught.mean, taught.std * std.to(taught.std.dtype), fitted_tail(residuals / std))
+    factor, tail = fitted(normal_scores(replace(seen, tail=None), trajectories))
+    return Forecast(taught.mean, taught.std * factor.sqrt().to(taught.std.dtype), tail)
 
 
 @dataclass(frozen=True)

@@ -92,10 +92,7 @@ def track(
         "mean_length": float(lengths.double().mean()),
         "one_step_nrmse": math.sqrt(min(report.nmse_one_step, LARGEST)),
         "one_step_typical": math.sqrt(min(float(taught[trajectories.valid].median()), LARGEST)),
-        "explosion_rate": report.explosion_rate,
-        "explosion_rate_standing": _exploded_standing(
-            report.open_loop_nmse, trajectories, report.imagined.mean, terminated
-        ),
+        **_explosions(report.open_loop_nmse, trajectories, report.imagined.mean, terminated),
         **_numbers("open_loop", report.open_loop),
         **_numbers("teacher_forced", report.teacher_forced),
         **{f"open_loop_nmse_at_{h}": min(value, LARGEST) for h, value in report.median_nmse.items()},
@@ -104,13 +101,14 @@ def track(
     return Tracking(numbers, {run: _curve(error, lengths) for run, error in errors.items()})
 
 
-def _exploded_standing(
+def _explosions(
     error: Tensor, trajectories: Trajectories, outcomes: Tensor, terminated: Callable[[Tensor], Tensor]
-) -> float:
-    """Share of trajectories that explode before the robot of these outcomes falls, where imagination would end them."""
-    fallen = terminated(outcomes[..., :-1]).int().cummax(1).values.bool()  # (B, T)
-    exploded = (error > EXPLODED) & trajectories.valid & ~fallen
-    return float(exploded.any(1).double().mean())
+) -> dict[str, float]:
+    """Share of trajectories that explode, and that do before the robot of these outcomes falls, as imagination ends."""
+    exploded = (error > EXPLODED) & trajectories.valid  # (B, T)
+    standing = exploded & ~terminated(outcomes[..., :-1]).int().cummax(1).values.bool()
+    rates = (("explosion_rate", exploded), ("explosion_rate_standing", standing))
+    return {name: float(steps.any(1).double().mean()) for name, steps in rates}
 
 
 def track_sampled(model: WorldModel, trajectories: Trajectories, scale: Scale, *, seed: int) -> Tracking:
@@ -124,13 +122,9 @@ def track_sampled(model: WorldModel, trajectories: Trajectories, scale: Scale, *
 
 def track_ceiling(name: str, found: Ceiling, terminated: Callable[[Tensor], Tensor] = never_terminated) -> Tracking:
     """A physics ceiling as numbers and a curve of that name; `terminated` is the robot's rule, as in `track`."""
-    error, trajectories = found.error, found.trajectories
-    exploded = ((error > EXPLODED) & trajectories.valid).any(1)
-    numbers = _numbers(name, found.steps) | {
-        f"{name}_explosion_rate": float(exploded.double().mean()),
-        f"{name}_explosion_rate_standing": _exploded_standing(error, trajectories, found.outcomes, terminated),
-    }
-    return Tracking(numbers, {name: _curve(error, trajectories.lengths)})
+    exploded = _explosions(found.error, found.trajectories, found.outcomes, terminated)
+    numbers = _numbers(name, found.steps) | {f"{name}_{rate}": value for rate, value in exploded.items()}
+    return Tracking(numbers, {name: _curve(found.error, found.trajectories.lengths)})
 
 
 def _numbers(name: str, by_threshold: Mapping[float, Steps]) -> dict[str, float]:

@@ -56,6 +56,12 @@ def variance_factor(residuals: Tensor) -> Tensor:
     return (bound / ANCHOR).square().nan_to_num(nan=FACTORS[1]).clamp(*FACTORS)
 
 
+def fitted(residuals: Tensor) -> tuple[Tensor, Tensor]:
+    """(K,) factors of the predictive variance, and the tails that go with them, of standardised residuals (n, K)."""
+    factor = variance_factor(residuals)
+    return factor, fitted_tail(residuals / factor.sqrt())
+
+
 def fitted_tail(residuals: Tensor) -> Tensor:
     """(K,) tails under which 50 % intervals hold half of the outcomes, from `LEAST` to `MOST`.
 

@@ -13,6 +13,7 @@ import math
 
 import torch
 from torch import Tensor
+from torch.special import ndtr
 
 LEVEL = 0.9
 LEAST, MOST = 1e-6, 1.0  # tails: a Gaussian's; one draw in two million lies beyond 50 std
@@ -54,7 +55,7 @@ def crps(z: Tensor, tail: Tensor) -> Tensor:
     """
     tail = tail.clamp(min=LEAST)
     score, unit = normal_score(z, tail), torch.exp(0.5 * tail.square()) / _slope(tail)
-    error = z * (2.0 * _below(score) - 1.0) + unit * (_below(tail - score) - _below(-tail - score))
+    error = z * (2.0 * ndtr(score) - 1.0) + unit * (ndtr(tail - score) - ndtr(-tail - score))
     return error - unit * torch.erf(0.5 * tail)
 
 
@@ -67,8 +68,3 @@ def _asinh(x: Tensor) -> Tensor:
 
 def _slope(tail: Tensor) -> Tensor:
     return torch.sinh(ANCHOR * tail) / ANCHOR
-
-
-def _below(score: Tensor) -> Tensor:
-    """The standard normal distribution function."""
-    return 0.5 * torch.erfc(-score / math.sqrt(2.0))

@@ -20,7 +20,7 @@ from envtf_lit.world_models.interface import Mode, Prediction
 from envtf_lit.world_models.laplace import LastLayerLaplace, clusters
 from envtf_lit.world_models.normaliser import Normaliser
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
-from envtf_lit.world_models.recalibration import fitted_tail, normal_scores, variance_factor
+from envtf_lit.world_models.recalibration import fitted, normal_scores
 from envtf_lit.world_models.tails import log_density, stretch
 
 LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -14.0, 4.0
@@ -397,10 +397,9 @@ class EnvironmentTransformer(nn.Module):
         self.recalibration.fill_(1.0)
         self.tail.zero_()
         trajectories = trajectories.to(self.recalibration.device)
-        residuals = normal_scores(forecast(self, trajectories, feedback="recorded"), trajectories)
-        factor = variance_factor(residuals)
+        factor, tail = fitted(normal_scores(forecast(self, trajectories, feedback="recorded"), trajectories))
         self.recalibration.copy_(factor)
-        self.tail.copy_(fitted_tail(residuals / factor.sqrt()))
+        self.tail.copy_(tail)
 
     def init(
         self,
