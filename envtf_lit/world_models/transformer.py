@@ -65,6 +65,17 @@ class Attention(nn.Module):
         q, k = rotate(qkv[:, :, :2], (cos[:, None, None], sin[:, None, None])).permute(2, 0, 3, 1, 4)
         return q, k, qkv[:, :, 2].transpose(1, 2)
 
+    def project_token(self, x: Tensor, cos_sin: tuple[Tensor, Tensor]) -> Tensor:
+        """(B, D), and the `rotation` (1, d) of their common position, to what `project` gives: (3, B, H, d).
+
+        The rotation is linear and the same for all rows, so that it turns the weights instead of what they give.
+        """
+        B, D = x.shape
+        weight, bias = (p.view(3, self.heads, D // self.heads, -1).mT for p in (self.qkv.weight, self.qkv.bias))
+        turned = (torch.cat([rotate(p[:2], cos_sin), p[2:]]).mT.reshape(3 * D, -1) for p in (weight, bias))
+        weight, bias = turned
+        return F.linear(x, weight, bias[:, 0]).view(B, 3, self.heads, D // self.heads).transpose(0, 1)
+
     def forward(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
         """Whole sequences (B, H, T, d); `mask` None means plain causal attention."""
         T = q.shape[2]
@@ -146,10 +157,10 @@ class Block(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The next token (B, D) of all rows, given the cache that it is written to; its output, and the cache."""
         context = keys.shape[0]
-        q, k, v = self.attention.project(self.attention_norm(x)[:, None], cos_sin)
+        q, k, v = self.attention.project_token(self.attention_norm(x), cos_sin)
         slot, filled = clock % context, min(clock + 1, context)
-        keys, values = _write(keys, k[:, :, 0], slot), _write(values, v[:, :, 0], slot)
-        return self.finish(x, self.attention.recall(q[:, :, 0], keys[:filled], values[:filled], mask)), keys, values
+        keys, values = _write(keys, k, slot), _write(values, v, slot)
+        return self.finish(x, self.attention.recall(q, keys[:filled], values[:filled], mask)), keys, values
 
     def finish(self, x: Tensor, attended: Tensor) -> Tensor:
         """The residual sums of both branches, given what attention returned."""
@@ -557,7 +568,7 @@ def _write(cache: Tensor, token: Tensor, slot: int) -> Tensor:
     """Puts (B, H, d) into a slot of (C, B, H, d): in place, or into a copy when gradients flow through it."""
     if torch.is_grad_enabled() and (token.requires_grad or cache.requires_grad):
         cache = cache.clone()
-    cache[slot] = token.to(cache.dtype)
+    cache[slot] = token
     return cache
 
 
