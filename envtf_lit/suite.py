@@ -35,7 +35,7 @@ MODELS = ("transformer", "context_1", "ensemble")  # their names in every table,
 PHYSICS = "physics"  # what stands beside them under that name, so that no other model may have it
 WORDS = ("trained_with", "note")  # of a dataset's origin: about the whole series, of which a tier may use a part
 SHARED = ("seed", "threads", "precision", "compile")  # options that a suite has in common with `Params`
-FORMAT = 2  # of saved transformers; those of before cannot be read and are trained anew
+FORMAT = 3  # of saved transformers; those of before cannot be read and are trained anew
 WORK = Path(".envtf/suite")  # where suites are kept unless told otherwise
 
 

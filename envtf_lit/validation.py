@@ -45,7 +45,9 @@ RANGES: dict[str, Range] = {
         ("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty", "tail", "posterior"),
         _NOT_NEGATIVE,
     ),
-    **dict.fromkeys(("cql_weight", "clone_weight", "warm_start", "selection_episodes"), _NOT_NEGATIVE),
+    **dict.fromkeys(
+        ("cql_weight", "clone_weight", "warm_start", "selection_episodes", "random_features"), _NOT_NEGATIVE
+    ),
     **dict.fromkeys(("learning_rate", "actor_learning_rate", "critic_learning_rate", "value_learning_rate"), _POSITIVE),
     **dict.fromkeys(
         (

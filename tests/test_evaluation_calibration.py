@@ -212,11 +212,12 @@ def test_novelty_is_that_of_the_last_token_after_the_true_past():
     log, model = random_log((30, 30)), make_model()
     model.fit_epistemic([batch_of(*sequences(40, 6))], generator=torch.Generator().manual_seed(0))
     points = draw_points(log, 7, history=5, seed=0)  # the model's context is 6
-    assert model.laplace is not None
+    assert model.laplace is not None and model.random_features is not None
     with torch.no_grad():
         actions = torch.cat([points.past_actions, points.actions[:, None]], 1)
         hidden, _ = model.encode(points.observations, actions, cached=False)
-        expected = model.laplace.leverage(hidden[:, -1]) / model.laplace.limit
+        random = model.random_features(model.normaliser.token(points.observations[:, -1], points.actions))
+        expected = model.laplace.leverage(torch.cat([hidden[:, -1], random], -1)) / model.laplace.limit
     found = novelties(model, points, batch_size=3)
     assert found is not None
     np.testing.assert_allclose(found, expected.numpy(), rtol=1e-4)

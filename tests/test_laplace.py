@@ -5,7 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit.params import ModelOptions
-from envtf_lit.world_models.laplace import RIDGE, LastLayerLaplace, clusters
+from envtf_lit.world_models.laplace import RIDGE, LastLayerLaplace, RandomFeatures, clusters
 from envtf_lit.world_models.objectives import beta_nll, paper_mse
 
 
@@ -63,6 +63,43 @@ def test_drawn_layers_vary_as_the_variance_says():
     torch.testing.assert_close(deviation.var(0), laplace.variance(laplace.leverage(query[0])), rtol=0.05, atol=0)
     again = laplace.deviation(query, drawn)
     assert torch.equal(deviation, again) and not torch.equal(deviation[0], deviation[1])
+
+
+def test_random_features_tell_apart_what_the_hidden_token_confuses():
+    """The hidden token knows the first of two inputs alone; strange pairs differ in the second."""
+    torch.manual_seed(0)
+    x, strange = torch.randn(2_000, 2), torch.randn(2_000, 2) + torch.tensor([0.0, 6.0])
+    hidden, random = (lambda x: torch.tanh(x[:, :1])), RandomFeatures(2, 64)
+    for seen, least, most in ((hidden, 0.4, 0.6), (lambda x: torch.cat([hidden(x), random(x)], -1), 0.999, 1.0)):
+        laplace = fitted(seen(x).double(), x[:, :1].double())
+        found = auroc(laplace.leverage(seen(x).double()), laplace.leverage(seen(strange).double()))
+        assert least <= found <= most
+
+
+def test_random_features_grow_with_distance_and_have_one_kink_each():
+    torch.manual_seed(0)
+    random = RandomFeatures(3, 1_000)
+    direction = nn.functional.normalize(torch.randn(3), dim=0)
+    values = random(torch.linspace(-20, 20, 4_001)[:, None] * direction)  # (4001, 1000)
+    bends = (values.diff(n=2, dim=0).abs() > 1e-4).sum(0)
+    assert (bends <= 2).all()  # a kink may lie between two points
+    assert float(random(100 * direction).square().mean() / random(50 * direction).square().mean()) == pytest.approx(
+        4, rel=0.05
+    )
+    assert RandomFeatures(3, 0)(torch.randn(5, 3)).shape == (5, 0)
+
+
+def test_leverage_is_as_exact_in_half_precision():
+    generator = torch.Generator().manual_seed(0)
+    hidden = torch.randn(2_000, 32, generator=generator) @ torch.randn(32, 32, generator=generator)
+    laplace = LastLayerLaplace(32, 1)
+    laplace.fit(hidden, hidden[:, :1], torch.zeros(2_000, 1), torch.ones(2_000, 1), torch.arange(2_000) % 5)
+    drawn = laplace.draw(2_000, generator)
+    leverage, deviation = laplace.leverage(hidden), laplace.deviation(hidden, drawn)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(laplace.leverage(hidden), leverage)
+        assert RandomFeatures(32, 8)(hidden).dtype == torch.float32
+        torch.testing.assert_close(laplace.deviation(hidden, drawn).float(), deviation, rtol=0.1, atol=0.01)
 
 
 def test_until_it_is_fitted_it_says_zero():

@@ -3,25 +3,56 @@
 A score of the outcome sees only the sum of aleatoric and epistemic variance, so no head can learn to tell them apart.
 The last layer, though, is a linear regression on the hidden token, and for that the posterior is known in closed form
 (the Laplace approximation, here exact up to the noise): it is wide where no training token pointed.
+
+A network may map strange inputs onto familiar hidden tokens, since nothing in training asked it to tell them apart. So
+the regression is given random features of the input beside them, which keep apart what differs. The mean makes no use
+of them, but the posterior has to allow for it; it is what an ensemble of linear heads with random priors tends to
+(Osband et al. 2018), without the ensemble.
 """
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 RIDGE = 1e-2  # lambda: the prior's precision, in units of the (unweighted) noise
 CLUSTERS, LLOYD_ITERATIONS = 10, 20
 SCALES = torch.logspace(-4, 8, 121, dtype=torch.float64)  # candidates for c
 OUTSIDE = 0.999  # quantile of the training tokens' leverage beyond which a token counts as new
 BLOCK = 4_096  # tokens whose likelihoods are computed at a time
+KINK = 2.0  # standard deviation of what random features rectify, at inputs of unit scale; their offsets have one of 1
+
+
+class RandomFeatures(nn.Module):
+    """`count` rectified random projections of the input: half-spaces that it lies in, and how deep (arc-cosine kernel).
+
+    Cho and Saul 2009, as features after Rahimi and Recht 2007. Drawn from torch's default generator, never trained.
+
+    Attributes:
+        weight: (M, F), `offset`: (M,).
+    """
+
+    weight: Tensor
+    offset: Tensor
+
+    def __init__(self, inputs: int, count: int) -> None:
+        super().__init__()
+        self.register_buffer("weight", KINK * inputs**-0.5 * torch.randn(count, inputs))
+        self.register_buffer("offset", torch.randn(count))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Inputs (..., F) of unit scale to features (..., M), in fp32 whatever the precision around it."""
+        with torch.autocast(x.device.type, enabled=False):
+            return F.relu(F.linear(x.to(self.weight.dtype), self.weight, self.offset))
 
 
 class LastLayerLaplace(nn.Module):
-    """`S_eu(x) = c diag(R) q(x)` with the leverage `q = phi^T (Phi^T Phi + lambda I)^-1 phi`, phi = [hidden token, 1].
+    """`S_eu(x) = c diag(R) q(x)` with the leverage `q = phi^T (Phi^T Phi + lambda I)^-1 phi`, phi = [features, 1].
 
-    Until `fit` it knows no data and says zero.
+    Features are what the last layer sees or might have seen: the hidden token, and random features of its input. Until
+    `fit` it knows no data and says zero.
 
     Attributes:
-        root: (D + 1, D + 1) W with `W^T W = (Phi^T Phi + lambda I)^-1`, so that `q = |W phi|^2`.
+        root: (P + 1, P + 1) W with `W^T W = (Phi^T Phi + lambda I)^-1`, so that `q = |W phi|^2`.
         residual: (K,) R, the variance of the training residuals of each output.
         scale: c, by which residuals on clusters of data left out of the last layer exceed what q says.
         limit: the 0.999 quantile of q over the training tokens.
@@ -32,32 +63,37 @@ class LastLayerLaplace(nn.Module):
     scale: Tensor
     limit: Tensor
 
-    def __init__(self, width: int, outputs: int) -> None:
+    def __init__(self, features: int, outputs: int) -> None:
         super().__init__()
-        self.register_buffer("root", torch.zeros(width + 1, width + 1))
+        self.register_buffer("root", torch.zeros(features + 1, features + 1))
         self.register_buffer("residual", torch.zeros(outputs))
         self.register_buffer("scale", torch.zeros(()))
         self.register_buffer("limit", torch.ones(()))
 
-    def leverage(self, hidden: Tensor) -> Tensor:
-        """q of hidden tokens (..., D), (...), at least zero; at most one at a training token."""
-        return (_with_one(hidden).to(self.root.dtype) @ self.root.T).square().sum(-1)
+    def leverage(self, features: Tensor) -> Tensor:
+        """q of features (..., P), (...), at least zero; at most one at a training token."""
+        return self._whitened(features).square().sum(-1)
+
+    def _whitened(self, features: Tensor) -> Tensor:
+        """W phi (..., P + 1), in which terms cancel: half precision would leave noise."""
+        with torch.autocast(features.device.type, enabled=False):
+            return F.linear(features.to(self.root.dtype), self.root[:, :-1], self.root[:, -1])
 
     def variance(self, leverage: Tensor) -> Tensor:
         """S_eu (..., K), in the unit scale of the targets."""
         return self.scale * leverage[..., None] * self.residual
 
     def draw(self, count: int, generator: torch.Generator | None = None) -> Tensor:
-        """Last layers drawn from the posterior, as deviations from the trained one: (count, D + 1, K) on q's root."""
+        """Last layers drawn from the posterior, as deviations from the trained one: (count, P + 1, K) on q's root."""
         size = (count, len(self.root), len(self.residual))
         return torch.randn(size, generator=generator, device=self.root.device, dtype=self.root.dtype)
 
-    def deviation(self, hidden: Tensor, drawn: Tensor) -> Tensor:
-        """What drawn last layers (B, D + 1, K) add to the mean at hidden tokens (B, D): (B, K), with variance S_eu."""
-        token = _with_one(hidden).to(self.root.dtype) @ self.root.T
-        return torch.einsum("bd,bdk->bk", token, drawn) * (self.scale * self.residual).sqrt()
+    def deviation(self, features: Tensor, drawn: Tensor) -> Tensor:
+        """What drawn last layers (B, P + 1, K) add to the mean at features (B, P): (B, K), with variance S_eu."""
+        token = self._whitened(features)
+        return torch.einsum("bp,bpk->bk", token, drawn) * (self.scale * self.residual).sqrt()
 
-    def fit(self, hidden: Tensor, targets: Tensor, mean: Tensor, aleatoric: Tensor, groups: Tensor) -> None:
+    def fit(self, features: Tensor, targets: Tensor, mean: Tensor, aleatoric: Tensor, groups: Tensor) -> None:
         """Takes the posterior from N training tokens, and c from what happens to groups that it has not seen.
 
         In-distribution data want no epistemic variance, so they cannot set its scale. For each group the last layer
@@ -65,11 +101,11 @@ class LastLayerLaplace(nn.Module):
         `N(0, S_au + c R q)`, q without the group too.
 
         Args:
-            hidden: (N, D) last hidden tokens.
+            features: (N, P) of the training tokens.
             targets, mean, aleatoric: (N, K) what they should predict, what they do, with which variance; unit scale.
             groups: (N,) int64, such as `clusters` gives.
         """
-        tokens, targets = _with_one(hidden).double(), targets.double()
+        tokens, targets = F.pad(features, (0, 1), value=1.0).double(), targets.double()
         residual = (targets - mean).square().mean(0)  # (K,)
         gram, moment = tokens.T @ tokens, tokens.T @ targets
         surprise = torch.zeros_like(SCALES)
@@ -77,7 +113,7 @@ class LastLayerLaplace(nn.Module):
             mine = (groups == group).nonzero()[:, 0]
             own = tokens[mine]
             root = _root(gram - own.T @ own)
-            solution = root.T @ (root @ (moment - own.T @ targets[mine]))  # (D + 1, K), ridge regression
+            solution = root.T @ (root @ (moment - own.T @ targets[mine]))  # (P + 1, K), ridge regression
             for rows in mine.split(BLOCK):
                 squared = (targets[rows] - tokens[rows] @ solution).square()
                 spread = (tokens[rows] @ root.T).square().sum(-1)[:, None] * residual
@@ -102,12 +138,8 @@ def clusters(points: Tensor, generator: torch.Generator, count: int = CLUSTERS) 
     return nearest
 
 
-def _with_one(hidden: Tensor) -> Tensor:
-    return nn.functional.pad(hidden, (0, 1), value=1.0)
-
-
 def _root(gram: Tensor) -> Tensor:
-    """W (D, D) with `W^T W = (gram + lambda I)^-1`."""
+    """W (P, P) with `W^T W = (gram + lambda I)^-1`."""
     identity = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
     factor = torch.linalg.cholesky(gram + RIDGE * identity)
     return torch.linalg.solve_triangular(factor, identity, upper=False)

@@ -17,7 +17,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.params import ModelOptions
 from envtf_lit.world_models.horizon import Trajectories, forecast
 from envtf_lit.world_models.interface import Mode, Prediction
-from envtf_lit.world_models.laplace import LastLayerLaplace, clusters
+from envtf_lit.world_models.laplace import LastLayerLaplace, RandomFeatures, clusters
 from envtf_lit.world_models.normaliser import Normaliser
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 from envtf_lit.world_models.recalibration import fitted, normal_scores
@@ -178,7 +178,7 @@ class TransformerState:
         clock: position of the next token, the same for all rows (histories are right-aligned).
         first: (B,) position of each row's first token, or None where all rows began at 0.
         observation: (B, S) current observation.
-        drawn: (B, D + 1, S + 1) each row's last layer, drawn from the posterior; None where all use the trained one.
+        drawn: (B, P + 1, S + 1) each row's last layer, drawn from the posterior; None where all use the trained one.
     """
 
     cache: list[tuple[Tensor, Tensor]]
@@ -227,13 +227,17 @@ class EnvironmentTransformer(nn.Module):
         self.blocks = nn.ModuleList(Block(self.options) for _ in range(self.options.layers))
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, (3 if self.has_epistemic_head else 2) * (observation_dim + 1))
-        self.laplace = LastLayerLaplace(width, observation_dim + 1) if self.options.epistemic == "laplace" else None
         self.register_buffer("recalibration", torch.ones(observation_dim + 1))
         self.register_buffer("tail", torch.zeros(observation_dim + 1))
         self.apply(_initialise)
         for block in self._stack():  # residual branches start small: sum of 2L terms keeps unit scale (GPT-2)
             for weight in (block.attention.out.weight, block.mlp[2].weight):
                 nn.init.normal_(cast(Tensor, weight), std=0.02 * (2 * self.options.layers) ** -0.5)
+        self.random_features, self.laplace = None, None
+        if self.options.epistemic == "laplace":
+            count = self.options.random_features
+            self.random_features = RandomFeatures(observation_dim + action_dim, count)
+            self.laplace = LastLayerLaplace(width + count, observation_dim + 1)
 
     def _stack(self) -> list[Block]:
         return cast(list[Block], list(self.blocks))
@@ -396,7 +400,12 @@ class EnvironmentTransformer(nn.Module):
         del parts
         groups = clusters(token, generator)
         mean, log_variance, _ = self.heads(hidden)
-        self.laplace.fit(hidden, target, mean, log_variance.exp(), groups)
+        self.laplace.fit(self._features(hidden, token), target, mean, log_variance.exp(), groups)
+
+    def _features(self, hidden: Tensor, token: Tensor) -> Tensor:
+        """(..., P) what the posterior sees of hidden tokens (..., D) and the pairs (..., S + A) they end in."""
+        assert self.random_features is not None
+        return torch.cat([hidden.float(), self.random_features(token)], -1)
 
     def recalibrate(self, trajectories: Trajectories) -> None:
         """Fits `recalibration` and `tail` to episodes kept out of training.
@@ -466,7 +475,8 @@ class EnvironmentTransformer(nn.Module):
         for block, (keys, values) in zip(self._stack(), state.cache, strict=True):
             x, keys, values = block.advance(x, keys, values, mask, state.clock, cos_sin)
             cache.append((keys, values))
-        prediction = self.predict(self.norm(x), state.observation, state.drawn, mode=mode, generator=generator)
+        pair = state.observation, action
+        prediction = self.predict(self.norm(x), *pair, state.drawn, mode=mode, generator=generator)
         return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
 
     def fuse(self) -> None:
@@ -487,30 +497,33 @@ class EnvironmentTransformer(nn.Module):
         self,
         hidden: Tensor,
         observation: Tensor,
+        action: Tensor,
         drawn: Tensor | None = None,
         *,
         mode: Mode = "mean",
         generator: torch.Generator | None = None,
     ) -> Prediction:
-        """Last hidden tokens (..., D) and current observations (..., S) to a `Prediction` in the data's units.
+        """Last hidden tokens (..., D) and the pairs they end in, (..., S) and (..., A), to a `Prediction`.
 
-        With drawn last layers (B, D + 1, S + 1) outcomes follow those, and differ by aleatoric noise alone; `log_prob`
+        With drawn last layers (B, P + 1, S + 1) outcomes follow those, and differ by aleatoric noise alone; `log_prob`
         is under the whole distribution nevertheless.
         """
         scale = self.normaliser.target_std
         mean, log_variance, epistemic_log_variance = self.heads(hidden)
-        epistemic, novelty = None, None
+        features, epistemic, novelty = None, None, None
         if epistemic_log_variance is not None:
             epistemic = epistemic_log_variance.exp()
         elif self.laplace is not None:
-            leverage = self.laplace.leverage(hidden.float())
+            features = self._features(hidden, self.normaliser.token(observation, action))
+            leverage = self.laplace.leverage(features)
             epistemic, novelty = self.laplace.variance(leverage), leverage / self.laplace.limit
         aleatoric = log_variance.exp() * self.recalibration
         epistemic = None if epistemic is None else epistemic * self.recalibration
         variance = aleatoric if epistemic is None else aleatoric + epistemic
         value, spread = mean, variance
         if drawn is not None:
-            deviation = self._posterior().deviation(hidden.float(), drawn)
+            assert features is not None
+            deviation = self._posterior().deviation(features, drawn)
             value, spread = mean + deviation * self.recalibration.sqrt(), aleatoric
         if mode == "sample":
             noise = stretch(torch.empty_like(mean).normal_(generator=generator), self.tail)
