@@ -21,7 +21,7 @@ def test_equals_bayesian_linear_regression():
     hidden = torch.randn(300, 8, generator=generator, dtype=torch.float64)
     targets = torch.randn(300, 3, generator=generator, dtype=torch.float64)
     laplace, query = fitted(hidden, targets), 3 * torch.randn(20, 8, generator=generator, dtype=torch.float64)
-    tokens, asked = (torch.cat([x, torch.ones(len(x), 1).double()], 1) for x in (hidden, query))
+    tokens, asked = (torch.cat([torch.ones(len(x), 1).double(), x], 1) for x in (hidden, query))
     noise = targets.square().mean(0)  # residuals of a mean of zero
     for k in range(
         3

@@ -53,7 +53,9 @@ def test_cached_generation_equals_the_uncached_pass_past_the_context(mode):
         for t in range(20):
             state, prediction = model.step(state, actions[:, t])
             hidden, _ = model.encode(torch.stack(observations, 1), actions[:, : t + 1], cached=False)
-            uncached = model.predict(hidden[:, -1], observations[-1], actions[:, t])
+            uncached = model.predict(
+                hidden[:, -1], model.normaliser.token(observations[-1], actions[:, t]), observations[-1]
+            )
             torch.testing.assert_close(prediction.observation, uncached.observation, atol=1e-5, rtol=1e-4)
             torch.testing.assert_close(prediction.aleatoric, uncached.aleatoric, atol=1e-5, rtol=1e-4)
             observations.append(prediction.observation)
@@ -75,7 +77,8 @@ def test_histories_of_different_length_equal_their_own_uncached_pass():
             done = torch.cat([done, actions[row : row + 1, t : t + 1]], 1)
             with torch.no_grad():
                 hidden, _ = model.encode(past, done, cached=False)
-                alone = model.predict(hidden[:, -1], past[:, -1], done[:, -1]).observation
+                token = model.normaliser.token(past[:, -1], done[:, -1])
+                alone = model.predict(hidden[:, -1], token, past[:, -1]).observation
             torch.testing.assert_close(steps[t][row], alone[0], atol=1e-5, rtol=1e-4)
             past = torch.cat([past, alone[:, None]], 1)
 
@@ -94,7 +97,8 @@ def test_rollouts_that_share_a_window_equal_those_with_histories_of_their_own():
         hidden, _ = model.encode(observations[1:, :7], actions[1:, :7], cached=False)
         fourth = model.init(observations, actions[:, :12], lengths[3:4], window[3:4])
         _, step = model.step(fourth, actions[1:, 6])
-        expected = model.predict(hidden[:, -1], observations[1:, 6], actions[1:, 6])
+        token = model.normaliser.token(observations[1:, 6], actions[1:, 6])
+        expected = model.predict(hidden[:, -1], token, observations[1:, 6])
     torch.testing.assert_close(step.observation, expected.observation)
 
 

@@ -179,7 +179,7 @@ def _cache(
     def uncached() -> None:
         for past, done in zip(*windows, strict=True):
             hidden, _ = encode(past, done, cached=False)
-            model.predict(hidden[:, -1], past[:, -1], done[:, -1])
+            model.predict(hidden[:, -1], model.normaliser.token(past[:, -1], done[:, -1]), past[:, -1])
 
     return {"cached": lambda: seconds(cached, device), "uncached": lambda: seconds(uncached, device)}
 

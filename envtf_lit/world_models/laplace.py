@@ -10,6 +10,8 @@ of them, but the posterior has to allow for it; it is what an ensemble of linear
 (Osband et al. 2018), without the ensemble.
 """
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -19,6 +21,7 @@ CLUSTERS, LLOYD_ITERATIONS = 10, 20
 SCALES = torch.logspace(-4, 8, 121, dtype=torch.float64)  # candidates for c
 OUTSIDE = 0.999  # quantile of the training tokens' leverage beyond which a token counts as new
 BLOCK = 4_096  # tokens whose likelihoods are computed at a time
+STRIPS = 4  # of rows of W, whose zeros beyond the diagonal are left out of the products
 KINK = 2.0  # standard deviation of what random features rectify, at inputs of unit scale; their offsets have one of 1
 
 
@@ -46,13 +49,13 @@ class RandomFeatures(nn.Module):
 
 
 class LastLayerLaplace(nn.Module):
-    """`S_eu(x) = c diag(R) q(x)` with the leverage `q = phi^T (Phi^T Phi + lambda I)^-1 phi`, phi = [features, 1].
+    """`S_eu(x) = c diag(R) q(x)` with the leverage `q = phi^T (Phi^T Phi + lambda I)^-1 phi`, phi = [1, features].
 
     Features are what the last layer sees or might have seen: the hidden token, and random features of its input. Until
     `fit` it knows no data and says zero.
 
     Attributes:
-        root: (P + 1, P + 1) W with `W^T W = (Phi^T Phi + lambda I)^-1`, so that `q = |W phi|^2`.
+        root: (P + 1, P + 1) W, lower-triangular, with `W^T W = (Phi^T Phi + lambda I)^-1`, so that `q = |W phi|^2`.
         residual: (K,) R, the variance of the training residuals of each output.
         scale: c, by which residuals on clusters of data left out of the last layer exceed what q says.
         limit: the 0.999 quantile of q over the training tokens.
@@ -72,12 +75,16 @@ class LastLayerLaplace(nn.Module):
 
     def leverage(self, features: Tensor) -> Tensor:
         """q of features (..., P), (...), at least zero; at most one at a training token."""
-        return self._whitened(features).square().sum(-1)
+        squares = (strip.square().sum(-1) for strip in self._whitened(features))
+        return sum(squares, start=self.root[0, 0].square())
 
-    def _whitened(self, features: Tensor) -> Tensor:
-        """W phi (..., P + 1), in which terms cancel: half precision would leave noise."""
+    def _whitened(self, features: Tensor) -> list[Tensor]:
+        """W phi (..., P) in strips, without its first entry, W_00. Terms cancel: half precision would leave noise."""
+        features, P = features.to(self.root.dtype), features.shape[-1]
+        ends = [P * strip // STRIPS for strip in range(STRIPS + 1)]
         with torch.autocast(features.device.type, enabled=False):
-            return F.linear(features.to(self.root.dtype), self.root[:, :-1], self.root[:, -1])
+            rows = [(self.root[begin + 1 : end + 1], end) for begin, end in pairwise(ends)]
+            return [F.linear(features[..., :end], row[:, 1 : end + 1], row[:, 0]) for row, end in rows]
 
     def variance(self, leverage: Tensor) -> Tensor:
         """S_eu (..., K), in the unit scale of the targets."""
@@ -90,8 +97,9 @@ class LastLayerLaplace(nn.Module):
 
     def deviation(self, features: Tensor, drawn: Tensor) -> Tensor:
         """What drawn last layers (B, P + 1, K) add to the mean at features (B, P): (B, K), with variance S_eu."""
-        token = self._whitened(features)
-        return torch.einsum("bp,bpk->bk", token, drawn) * (self.scale * self.residual).sqrt()
+        whitened = torch.cat(self._whitened(features), -1)
+        sums = self.root[0, 0] * drawn[:, 0] + torch.einsum("bp,bpk->bk", whitened, drawn[:, 1:])
+        return sums * (self.scale * self.residual).sqrt()
 
     def fit(self, features: Tensor, targets: Tensor, mean: Tensor, aleatoric: Tensor, groups: Tensor) -> None:
         """Takes the posterior from N training tokens, and c from what happens to groups that it has not seen.
@@ -105,7 +113,7 @@ class LastLayerLaplace(nn.Module):
             targets, mean, aleatoric: (N, K) what they should predict, what they do, with which variance; unit scale.
             groups: (N,) int64, such as `clusters` gives.
         """
-        tokens, targets = F.pad(features, (0, 1), value=1.0).double(), targets.double()
+        tokens, targets = F.pad(features, (1, 0), value=1.0).double(), targets.double()
         residual = (targets - mean).square().mean(0)  # (K,)
         gram, moment = tokens.T @ tokens, tokens.T @ targets
         surprise = torch.zeros_like(SCALES)

@@ -468,15 +468,16 @@ class EnvironmentTransformer(nn.Module):
         generator: torch.Generator | None = None,
     ) -> tuple[TransformerState, Prediction]:
         """See `WorldModel.step`. One token per call; the cache is written in place unless gradients are needed."""
-        x = self.embed(self.normaliser.token(state.observation, action))  # (B, D)
+        token = self.normaliser.token(state.observation, action)
+        x = self.embed(token)  # (B, D)
         mask = self._visible(state, min(state.clock + 1, self.options.context))
         cos_sin = self._rotation(torch.full((1,), state.clock, device=x.device))
         cache = []
         for block, (keys, values) in zip(self._stack(), state.cache, strict=True):
             x, keys, values = block.advance(x, keys, values, mask, state.clock, cos_sin)
             cache.append((keys, values))
-        pair = state.observation, action
-        prediction = self.predict(self.norm(x), *pair, state.drawn, mode=mode, generator=generator)
+        last = self.norm(x), token, state.observation
+        prediction = self.predict(*last, state.drawn, mode=mode, generator=generator)
         return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
 
     def fuse(self) -> None:
@@ -496,14 +497,14 @@ class EnvironmentTransformer(nn.Module):
     def predict(
         self,
         hidden: Tensor,
+        token: Tensor,
         observation: Tensor,
-        action: Tensor,
         drawn: Tensor | None = None,
         *,
         mode: Mode = "mean",
         generator: torch.Generator | None = None,
     ) -> Prediction:
-        """Last hidden tokens (..., D) and the pairs they end in, (..., S) and (..., A), to a `Prediction`.
+        """Last hidden tokens (..., D) of pairs (..., S + A), as normalised, in states (..., S), to a `Prediction`.
 
         With drawn last layers (B, P + 1, S + 1) outcomes follow those, and differ by aleatoric noise alone; `log_prob`
         is under the whole distribution nevertheless.
@@ -514,7 +515,7 @@ class EnvironmentTransformer(nn.Module):
         if epistemic_log_variance is not None:
             epistemic = epistemic_log_variance.exp()
         elif self.laplace is not None:
-            features = self._features(hidden, self.normaliser.token(observation, action))
+            features = self._features(hidden, token)
             leverage = self.laplace.leverage(features)
             epistemic, novelty = self.laplace.variance(leverage), leverage / self.laplace.limit
         aleatoric = log_variance.exp() * self.recalibration
