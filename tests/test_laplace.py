@@ -65,28 +65,40 @@ def test_drawn_layers_vary_as_the_variance_says():
     assert torch.equal(deviation, again) and not torch.equal(deviation[0], deviation[1])
 
 
+def random_features(x: Tensor, count: int, seed: int = 0) -> RandomFeatures:
+    random = RandomFeatures(x.shape[1], count)
+    random.fit(x, torch.Generator().manual_seed(seed))
+    return random
+
+
 def test_random_features_tell_apart_what_the_hidden_token_confuses():
     """The hidden token knows the first of two inputs alone; strange pairs differ in the second."""
     torch.manual_seed(0)
     x, strange = torch.randn(2_000, 2), torch.randn(2_000, 2) + torch.tensor([0.0, 6.0])
-    hidden, random = (lambda x: torch.tanh(x[:, :1])), RandomFeatures(2, 64)
+    hidden, random = (lambda x: torch.tanh(x[:, :1])), random_features(x, 64)
     for seen, least, most in ((hidden, 0.4, 0.6), (lambda x: torch.cat([hidden(x), random(x)], -1), 0.999, 1.0)):
         laplace = fitted(seen(x).double(), x[:, :1].double())
         found = auroc(laplace.leverage(seen(x).double()), laplace.leverage(seen(strange).double()))
         assert least <= found <= most
 
 
-def test_random_features_grow_with_distance_and_have_one_kink_each():
+def test_random_features_see_whitened_inputs_and_grow_with_distance():
     torch.manual_seed(0)
-    random = RandomFeatures(3, 1_000)
-    direction = nn.functional.normalize(torch.randn(3), dim=0)
-    values = random(torch.linspace(-20, 20, 4_001)[:, None] * direction)  # (4001, 1000)
-    bends = (values.diff(n=2, dim=0).abs() > 1e-4).sum(0)
-    assert (bends <= 2).all()  # a kink may lie between two points
-    assert float(random(100 * direction).square().mean() / random(50 * direction).square().mean()) == pytest.approx(
-        4, rel=0.05
-    )
-    assert RandomFeatures(3, 0)(torch.randn(5, 3)).shape == (5, 0)
+    x = torch.randn(2_000, 3) * torch.tensor([1.0, 0.3, 1.0]) + 5  # the middle one varies little
+    random = random_features(x, 1_000)
+    plain = random_features((x - 5) * torch.tensor([1.0, 1 / 0.3, 1.0]), 1_000)
+    assert float(random(x).square().mean()) == pytest.approx(float(plain((x - 5) / x.std(0)).square().mean()), rel=0.1)
+    far = nn.functional.normalize(torch.randn(3), dim=0)
+    growth = random(100 * far).square().mean() / random(50 * far).square().mean()
+    assert float(growth) == pytest.approx(4, rel=0.3)
+    assert torch.equal(random.weight, random_features(x, 1_000).weight)
+    assert not torch.equal(random.weight, random_features(x, 1_000, seed=1).weight)
+    assert random_features(x, 0)(x).shape == (2_000, 0)
+
+
+def test_a_constant_input_does_not_break_random_features():
+    x = torch.cat([torch.randn(500, 2, generator=torch.Generator().manual_seed(0)), torch.zeros(500, 1)], 1)
+    assert random_features(x, 16)(x).isfinite().all()
 
 
 def test_leverage_is_as_exact_in_half_precision():
@@ -98,7 +110,7 @@ def test_leverage_is_as_exact_in_half_precision():
     leverage, deviation = laplace.leverage(hidden), laplace.deviation(hidden, drawn)
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(laplace.leverage(hidden), leverage)
-        assert RandomFeatures(32, 8)(hidden).dtype == torch.float32
+        assert random_features(hidden, 8)(hidden).dtype == torch.float32
         torch.testing.assert_close(laplace.deviation(hidden, drawn).float(), deviation, rtol=0.1, atol=0.01)
 
 

@@ -22,13 +22,15 @@ SCALES = torch.logspace(-4, 8, 121, dtype=torch.float64)  # candidates for c
 OUTSIDE = 0.999  # quantile of the training tokens' leverage beyond which a token counts as new
 BLOCK = 4_096  # tokens whose likelihoods are computed at a time
 STRIPS = 4  # of rows of W, whose zeros beyond the diagonal are left out of the products
-KINK = 2.0  # standard deviation of what random features rectify, at inputs of unit scale; their offsets have one of 1
+SPREAD = 4.0  # standard deviation of random features before they are rectified; their offsets have one of 1
+NARROW = 0.01  # of the largest variance, below which a direction's counts as that when the input is whitened
 
 
 class RandomFeatures(nn.Module):
-    """`count` rectified random projections of the input: half-spaces that it lies in, and how deep (arc-cosine kernel).
+    """`count` rectified random projections of the whitened input: half-spaces, and how deep in them it lies.
 
-    Cho and Saul 2009, as features after Rahimi and Recht 2007. Drawn from torch's default generator, never trained.
+    As features (Rahimi and Recht 2007) of the arc-cosine kernel (Cho and Saul 2009), their directions orthogonal as far
+    as there are dimensions (Yu et al. 2016). Zero until `fit`.
 
     Attributes:
         weight: (M, F), `offset`: (M,).
@@ -39,11 +41,27 @@ class RandomFeatures(nn.Module):
 
     def __init__(self, inputs: int, count: int) -> None:
         super().__init__()
-        self.register_buffer("weight", KINK * inputs**-0.5 * torch.randn(count, inputs))
-        self.register_buffer("offset", torch.randn(count))
+        self.register_buffer("weight", torch.zeros(count, inputs))
+        self.register_buffer("offset", torch.zeros(count))
+
+    def fit(self, x: Tensor, generator: torch.Generator) -> None:
+        """Draws the projections, blind to how strongly inputs (N, F) vary in which direction."""
+        mean, covariance = x.double().mean(0), torch.cov(x.double().T)
+        variances, directions = torch.linalg.eigh(covariance)
+        whiten = directions / variances.clamp(min=NARROW * float(variances[-1])).sqrt()  # (F, F)
+        count, inputs = self.weight.shape
+        blocks = torch.randn(-(-count // inputs), inputs, inputs, generator=generator)
+        lengths = torch.randn(count, inputs, generator=generator).norm(dim=1).to(whiten)
+        offset = torch.randn(count, generator=generator).to(whiten)
+        drawn = (
+            torch.linalg.qr(blocks).Q.flatten(0, 1)[:count].to(whiten) * lengths[:, None]
+        )  # rows as of a normal matrix
+        weight = SPREAD * inputs**-0.5 * drawn @ whiten.T
+        self.weight.copy_(weight)
+        self.offset.copy_(offset - weight @ mean)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Inputs (..., F) of unit scale to features (..., M), in fp32 whatever the precision around it."""
+        """Inputs (..., F) to features (..., M), in fp32 whatever the precision around it."""
         with torch.autocast(x.device.type, enabled=False):
             return F.relu(F.linear(x.to(self.weight.dtype), self.weight, self.offset))
 

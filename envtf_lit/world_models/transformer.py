@@ -384,9 +384,9 @@ class EnvironmentTransformer(nn.Module):
 
         Args:
             batches: as `loss` takes them.
-            generator: of the clusters of (s, a) that set the posterior's scale.
+            generator: of the clusters of (s, a) that set the posterior's scale, and of random features.
         """
-        if self.laplace is None:
+        if self.laplace is None or self.random_features is None:
             return
         parts = []
         for batch in batches:
@@ -399,10 +399,11 @@ class EnvironmentTransformer(nn.Module):
         hidden, target, token = (torch.cat(columns) for columns in zip(*parts, strict=True))
         del parts
         groups = clusters(token, generator)
+        self.random_features.fit(token, generator)
         mean, log_variance, _ = self.heads(hidden)
-        self.laplace.fit(self._features(hidden, token), target, mean, log_variance.exp(), groups)
+        self.laplace.fit(self.features(hidden, token), target, mean, log_variance.exp(), groups)
 
-    def _features(self, hidden: Tensor, token: Tensor) -> Tensor:
+    def features(self, hidden: Tensor, token: Tensor) -> Tensor:
         """(..., P) what the posterior sees of hidden tokens (..., D) and the pairs (..., S + A) they end in."""
         assert self.random_features is not None
         return torch.cat([hidden.float(), self.random_features(token)], -1)
@@ -515,7 +516,7 @@ class EnvironmentTransformer(nn.Module):
         if epistemic_log_variance is not None:
             epistemic = epistemic_log_variance.exp()
         elif self.laplace is not None:
-            features = self._features(hidden, token)
+            features = self.features(hidden, token)
             leverage = self.laplace.leverage(features)
             epistemic, novelty = self.laplace.variance(leverage), leverage / self.laplace.limit
         aleatoric = log_variance.exp() * self.recalibration

@@ -1,8 +1,9 @@
-"""Random-prior heads beside the last layer's posterior: `python benchmarks/priors.py --out OUT.json --robot hopper`.
+"""What tells strange pairs from familiar ones: `python benchmarks/novelty.py --out OUT.json --robot hopper`.
 
-Ten small networks on the hidden token, each with a fixed random network of its own added (Osband et al. 2018), learn
-the transformer's training residuals; where they disagree, data were lacking. Judged as `envtf calibrate` judges, on the
-same pairs: AUROC of each contrast. The suite's models are taken from the work folder, or trained.
+First the posterior of the last layer, with more or fewer random features beside the hidden token. Then random-prior
+heads (Osband et al. 2018): ten small networks on the hidden token, each with a fixed random network of its own added,
+which learn the transformer's training residuals; where they disagree, data were lacking. Judged as `envtf calibrate`
+judges, on the same pairs. The suite's transformer is taken from the work folder, or trained.
 """
 
 import argparse
@@ -18,13 +19,14 @@ from torch import Tensor, nn
 
 from envtf_lit.calibration import CalibrationOptions, Course
 from envtf_lit.data.loaders import Windows
-from envtf_lit.evaluation.calibration import Points, auroc, novelties
+from envtf_lit.evaluation.calibration import Points, auroc
 from envtf_lit.suite import WORK, SuiteOptions, build_suite
 from envtf_lit.tasks import ROBOTS, get_task
+from envtf_lit.world_models.lit import EPISTEMIC_TOKENS
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
-HEADS, HIDDEN, UPDATES, BATCH, ROWS = 10, 128, 2_000, 256, 50_000
+HEADS, HIDDEN, UPDATES, BATCH, ROWS = 10, 128, 2_000, 256, 50_000  # of the random priors
 
 
 class Networks(nn.Module):
@@ -41,8 +43,8 @@ class Networks(nn.Module):
         return torch.tanh(x @ self.first + self.bias) @ self.second
 
 
-def features(model: EnvironmentTransformer, points: Points) -> tuple[Tensor, Tensor]:
-    """Last hidden tokens (N, D) and normalised pairs (N, S + A)."""
+def tokens(model: EnvironmentTransformer, points: Points) -> tuple[Tensor, Tensor]:
+    """Last hidden tokens (N, D), and the normalised pairs (N, S + A) they end in."""
     last, rows = points.lengths - 1, torch.arange(len(points.actions))
     actions = nn.functional.pad(points.past_actions, (0, 0, 0, 1))
     actions[rows, last] = points.actions
@@ -77,12 +79,37 @@ def train(
     return learner, prior
 
 
+def refit(model: EnvironmentTransformer, windows: Windows, count: int, seed: int) -> EnvironmentTransformer:
+    """The same network with a posterior that sees so many random features."""
+    other = EnvironmentTransformer(**model.arguments | {"random_features": count}).eval()
+    skipped = ("random_features.", "laplace.")
+    other.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith(skipped)}, strict=False)
+    generator = torch.Generator().manual_seed(seed)
+    tiles = windows.tiles()
+    tiles = tiles[torch.randperm(len(tiles), generator=generator)[: EPISTEMIC_TOKENS // model.options.context]]
+    other.fit_epistemic((windows[part] for part in tiles.split(256)), generator=generator)
+    return other
+
+
+@torch.no_grad()
+def milliseconds(model: EnvironmentTransformer, points: Points, repeats: int = 20) -> float:
+    """Median wall time of the posterior's part of a step, for as many pairs as there are points."""
+    hidden, token = tokens(model, points)
+    assert model.laplace is not None
+    taken = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        model.laplace.leverage(model.features(hidden, token))
+        taken.append(time.perf_counter() - begin)
+    return round(1e3 * float(np.median(taken)), 2)
+
+
 @torch.no_grad()
 def spread(
     model: EnvironmentTransformer, learner: Networks, prior: Networks, weight: float, points: Points
 ) -> np.ndarray:
     """(N,) variance over the heads, mean over the outputs."""
-    hidden, token = features(model, points)
+    hidden, token = tokens(model, points)
     return (learner(hidden) + weight * prior(token)).var(0).mean(-1).numpy()
 
 
@@ -94,7 +121,8 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=WORK, metavar="DIR")
     parser.add_argument("--transitions", type=int, default=100_000)
     parser.add_argument("--updates", type=int, default=6_000, help="of the transformer")
-    parser.add_argument("--weights", type=float, nargs="+", default=[0.3, 1.0, 3.0], help="of the random networks")
+    parser.add_argument("--features", type=int, nargs="*", default=[0, 64, 128, 256, 512, 1024], help="random ones")
+    parser.add_argument("--weights", type=float, nargs="*", default=[0.3, 1.0, 3.0], help="of the random networks")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     given = parser.parse_args()
@@ -107,9 +135,13 @@ def main() -> None:
     course = Course(task, suite, CalibrationOptions(), True)
     windows = Windows(suite.split()[0], model.options.context)
     result: dict[str, object] = {name: value for name, value in vars(given).items() if name not in ("out", "work")}
-    known = novelties(model, course.familiar)
-    for contrast, points in course.strange.items():
-        result[f"laplace.auroc_{contrast}"] = auroc(known, novelties(model, points))
+    for count in given.features:
+        other = refit(model, windows, count, given.seed)
+        numbers, _ = course.detection(other)
+        numbers |= {"rank_correlation": course.rollouts(other)[0]["rank_correlation"]}
+        assert other.laplace is not None
+        numbers |= {"scale": float(other.laplace.scale), "milliseconds": milliseconds(other, course.familiar)}
+        result |= {f"features_{count}.{name}": value for name, value in numbers.items()}
     for weight in given.weights:
         begin = time.perf_counter()
         learner, prior = train(model, windows, weight, torch.Generator().manual_seed(given.seed))
