@@ -53,10 +53,8 @@ class RandomFeatures(nn.Module):
         blocks = torch.randn(-(-count // inputs), inputs, inputs, generator=generator)
         lengths = torch.randn(count, inputs, generator=generator).norm(dim=1).to(whiten)
         offset = torch.randn(count, generator=generator).to(whiten)
-        drawn = (
-            torch.linalg.qr(blocks).Q.flatten(0, 1)[:count].to(whiten) * lengths[:, None]
-        )  # rows as of a normal matrix
-        weight = SPREAD * inputs**-0.5 * drawn @ whiten.T
+        drawn = torch.linalg.qr(blocks).Q.flatten(0, 1)[:count].to(whiten)  # of length one, orthogonal in each block
+        weight = SPREAD * inputs**-0.5 * (drawn * lengths[:, None]) @ whiten.T
         self.weight.copy_(weight)
         self.offset.copy_(offset - weight @ mean)
 
