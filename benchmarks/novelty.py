@@ -99,7 +99,7 @@ def milliseconds(model: EnvironmentTransformer, points: Points, repeats: int = 2
     taken = []
     for _ in range(repeats):
         begin = time.perf_counter()
-        model.laplace.leverage(model.features(hidden, token))
+        model.laplace.leverage(model.posterior_inputs(hidden, token))
         taken.append(time.perf_counter() - begin)
     return round(1e3 * float(np.median(taken)), 2)
 

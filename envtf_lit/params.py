@@ -40,8 +40,8 @@ class ModelOptions:
         target: `delta` predicts the scaled change of the state, `absolute` the z-scored next state (the paper's form).
         epistemic: where epistemic variance comes from: `laplace`, the posterior of the last layer, fitted after
             training; `head`, the paper's third head, trained with the rest; `none`.
-        random_features: of the state-action pair, which that posterior sees beside the last hidden token: more detect
-            strange pairs better and take longer.
+        random_features: of the state-action pair, which the posterior of `laplace` sees beside the last hidden token:
+            more detect strange pairs better, and its time grows with their square.
         bounded: predictions stay within the range of the training data, widened by a tenth of it at either end, so that
             no rollout runs away.
         scheduled_sampling: share of the input states that, in training, are the model's own predictions, which it

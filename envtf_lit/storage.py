@@ -138,7 +138,7 @@ def load_weights(module: nn.Module, path: str | Path) -> None:
         odd = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))[0]
         raise UserError(
             f"{path} does not fit the model: {odd} has shape {found.get(odd)} in the file and {expected.get(odd)} in "
-            "the model; use the configuration it was saved with."
+            "the model; it was saved with another configuration, or by another version of envtf_lit: train it anew."
         )
     module.load_state_dict(tensors)
 

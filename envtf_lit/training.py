@@ -136,9 +136,9 @@ def freeze(module: nn.Module, parts: Sequence[str]) -> None:
         parts: names of submodules or parameters, such as `blocks`, `blocks.0` or `head.bias`.
 
     Raises:
-        UserError: it has no such part, or nothing is left to train.
+        UserError: it has no such part with parameters, or nothing is left to train.
     """
-    modules = [name for name, _ in module.named_modules() if name]
+    modules = [name for name, inner in module.named_modules() if name and any(True for _ in inner.parameters())]
     for part in parts:
         if part not in modules and part not in dict(module.named_parameters()):
             large = [name for name in modules if name.count(".") < 2]

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit.params import ModelOptions
-from envtf_lit.world_models.laplace import RIDGE, LastLayerLaplace, RandomFeatures, clusters
+from envtf_lit.world_models.laplace import RIDGE, SPREAD, LastLayerLaplace, RandomFeatures, clusters
 from envtf_lit.world_models.objectives import beta_nll, paper_mse
 
 
@@ -96,9 +96,26 @@ def test_random_features_see_whitened_inputs_and_grow_with_distance():
     assert random_features(x, 0)(x).shape == (2_000, 0)
 
 
-def test_a_constant_input_does_not_break_random_features():
-    x = torch.cat([torch.randn(500, 2, generator=torch.Generator().manual_seed(0)), torch.zeros(500, 1)], 1)
-    assert random_features(x, 16)(x).isfinite().all()
+def test_directions_point_everywhere_alike():
+    """Blocks of a QR decomposition alone lean to one side of each axis."""
+    x = torch.randn(20_000, 5, generator=torch.Generator().manual_seed(0))
+    weight = random_features(x, 20_000).weight / SPREAD  # nearly unit covariance / 5
+    assert float(weight.mean(0).abs().max()) < 0.015
+    torch.testing.assert_close(5 * weight.T @ weight / len(weight), torch.eye(5), atol=0.1, rtol=0)
+    blocks = weight[:5] @ weight[:5].T
+    assert float((blocks - blocks.diagonal().diag()).abs().max()) < 0.1  # orthogonal, but for the whitening
+    signs = (weight.view(-1, 5, 5).diagonal(dim1=1, dim2=2) > 0).double().mean(0)
+    assert ((signs > 0.45) & (signs < 0.55)).all()
+
+
+def test_constant_inputs_are_not_seen_and_leave_nothing_to_chance():
+    """Two constant columns share an eigenvalue, whose eigenvectors are arbitrary."""
+    x = torch.cat([torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), torch.ones(500, 2)], 1)
+    random = random_features(x, 16)
+    assert not random.weight[:, 3:].any() and random(x).isfinite().all()
+    disturbed = random_features(x + 1e-8 * torch.randn(500, 5), 16)
+    torch.testing.assert_close(disturbed.weight, random.weight, atol=1e-4, rtol=1e-4)
+    assert random_features(torch.ones(10, 1), 2)(torch.ones(1, 1)).isfinite().all()
 
 
 def test_leverage_is_as_exact_in_half_precision():

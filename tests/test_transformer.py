@@ -102,6 +102,17 @@ def test_rollouts_that_share_a_window_equal_those_with_histories_of_their_own():
     torch.testing.assert_close(step.observation, expected.observation)
 
 
+@pytest.mark.parametrize("rows", [1, 100, 600])
+def test_one_tokens_projection_is_that_of_whole_sequences(rows):
+    """Whichever is turned, few rows or the weights of many."""
+    attention = Attention(ModelOptions(width=64, heads=4))
+    torch.nn.init.normal_(attention.qkv.bias)
+    x = torch.randn(rows, 64, generator=torch.Generator().manual_seed(0))
+    cos_sin = rotation(torch.tensor([7]), 16)
+    expected = [part[:, :, 0] for part in attention.project(x[:, None], cos_sin)]
+    torch.testing.assert_close(list(attention.project_token(x, cos_sin)), expected, atol=1e-5, rtol=1e-5)
+
+
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_large_cache_is_read_token_by_token_to_the_same_effect(masked):
     """Both ways to attend, on either side of the size at which a CPU changes over."""

@@ -5,9 +5,9 @@ The last layer, though, is a linear regression on the hidden token, and for that
 (the Laplace approximation, here exact up to the noise): it is wide where no training token pointed.
 
 A network may map strange inputs onto familiar hidden tokens, since nothing in training asked it to tell them apart. So
-the regression is given random features of the input beside them, which keep apart what differs. The mean makes no use
-of them, but the posterior has to allow for it; it is what an ensemble of linear heads with random priors tends to
-(Osband et al. 2018), without the ensemble.
+the regression is given random features of the input beside them, which keep apart what differs. Its posterior is as
+wide as an ensemble of linear heads on all of them, with random priors (Osband et al. 2018), would be. Its mean is not
+used: predictions are the trained head's, and draws deviate from these.
 """
 
 from itertools import pairwise
@@ -16,13 +16,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from envtf_lit.world_models.normaliser import CONSTANT
+
 RIDGE = 1e-2  # lambda: the prior's precision, in units of the (unweighted) noise
 CLUSTERS, LLOYD_ITERATIONS = 10, 20
 SCALES = torch.logspace(-4, 8, 121, dtype=torch.float64)  # candidates for c
 OUTSIDE = 0.999  # quantile of the training tokens' leverage beyond which a token counts as new
 BLOCK = 4_096  # tokens whose likelihoods are computed at a time
 STRIPS = 4  # of rows of W, whose zeros beyond the diagonal are left out of the products
-SPREAD = 4.0  # standard deviation of random features before they are rectified; their offsets have one of 1
+SPREAD = (
+    4.0  # standard deviation of random features before they are rectified, offsets have one of 1; see calibration.md
+)
 NARROW = 0.01  # of the largest variance, below which a direction's counts as that when the input is whitened
 
 
@@ -45,16 +49,14 @@ class RandomFeatures(nn.Module):
         self.register_buffer("offset", torch.zeros(count))
 
     def fit(self, x: Tensor, generator: torch.Generator) -> None:
-        """Draws the projections, blind to how strongly inputs (N, F) vary in which direction."""
-        mean, covariance = x.double().mean(0), torch.cov(x.double().T)
-        variances, directions = torch.linalg.eigh(covariance)
-        whiten = directions / variances.clamp(min=NARROW * float(variances[-1])).sqrt()  # (F, F)
+        """Draws the projections, blind to how strongly inputs (N, F) vary in which direction (down to `NARROW`)."""
         count, inputs = self.weight.shape
+        mean, whiten = x.double().mean(0), _whitening(x.double())
         blocks = torch.randn(-(-count // inputs), inputs, inputs, generator=generator)
         lengths = torch.randn(count, inputs, generator=generator).norm(dim=1).to(whiten)
         offset = torch.randn(count, generator=generator).to(whiten)
-        drawn = torch.linalg.qr(blocks).Q.flatten(0, 1)[:count].to(whiten)  # of length one, orthogonal in each block
-        weight = SPREAD * inputs**-0.5 * (drawn * lengths[:, None]) @ whiten.T
+        drawn = _rotations(blocks).flatten(0, 1)[:count].to(whiten)  # of length one, orthogonal in each block
+        weight = SPREAD * inputs**-0.5 * (drawn * lengths[:, None]) @ whiten
         self.weight.copy_(weight)
         self.offset.copy_(offset - weight @ mean)
 
@@ -73,7 +75,7 @@ class LastLayerLaplace(nn.Module):
     Attributes:
         root: (P + 1, P + 1) W, lower-triangular, with `W^T W = (Phi^T Phi + lambda I)^-1`, so that `q = |W phi|^2`.
         residual: (K,) R, the variance of the training residuals of each output.
-        scale: c, by which residuals on clusters of data left out of the last layer exceed what q says.
+        scale: c, by which residuals of the regression, on clusters of data left out of it, exceed what q says.
         limit: the 0.999 quantile of q over the training tokens.
     """
 
@@ -160,6 +162,24 @@ def clusters(points: Tensor, generator: torch.Generator, count: int = CLUSTERS) 
         centres = sums / sizes[:, None]
         nearest = torch.cdist(points, centres).argmin(1)
     return nearest
+
+
+def _whitening(x: Tensor) -> Tensor:
+    """(F, F), symmetric: gives inputs (N, F) unit variance in all directions in which they vary; constants count not.
+
+    Symmetric, for eigenvectors alone are arbitrary in sign, and where variances are alike.
+    """
+    covariance = torch.cov(x.T).reshape(x.shape[1], x.shape[1])
+    variances, directions = torch.linalg.eigh(covariance)
+    least = max(NARROW * float(variances[-1]), CONSTANT**2)
+    whitening = directions / variances.clamp(min=least).sqrt() @ directions.T
+    return whitening * (covariance.diagonal() >= CONSTANT**2)
+
+
+def _rotations(blocks: Tensor) -> Tensor:
+    """Normal matrices (..., F, F) to uniformly random orthogonal ones (Mezzadri 2007)."""
+    rotations, triangles = torch.linalg.qr(blocks)
+    return rotations * triangles.diagonal(dim1=-2, dim2=-1).sign()[..., None, :]
 
 
 def _root(gram: Tensor) -> Tensor:

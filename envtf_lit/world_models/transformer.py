@@ -65,16 +65,18 @@ class Attention(nn.Module):
         q, k = rotate(qkv[:, :, :2], (cos[:, None, None], sin[:, None, None])).permute(2, 0, 3, 1, 4)
         return q, k, qkv[:, :, 2].transpose(1, 2)
 
-    def project_token(self, x: Tensor, cos_sin: tuple[Tensor, Tensor]) -> Tensor:
-        """(B, D), and the `rotation` (1, d) of their common position, to what `project` gives: (3, B, H, d).
-
-        The rotation is linear and the same for all rows, so that it turns the weights instead of what they give.
-        """
+    def project_token(self, x: Tensor, cos_sin: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """(B, D), and the `rotation` (1, d) of their common position, to what `project` gives, each (B, H, d)."""
         B, D = x.shape
+        if B < 8 * D:
+            qkv = self.qkv(x).view(B, 3, self.heads, D // self.heads)
+            q, k = rotate(qkv[:, :2], cos_sin).unbind(1)
+            return q, k, qkv[:, 2]
+        # many rows: the rotation is linear and the same for all, so that it can turn the weights in their place
         weight, bias = (p.view(3, self.heads, D // self.heads, -1).mT for p in (self.qkv.weight, self.qkv.bias))
-        turned = (torch.cat([rotate(p[:2], cos_sin), p[2:]]).mT.reshape(3 * D, -1) for p in (weight, bias))
-        weight, bias = turned
-        return F.linear(x, weight, bias[:, 0]).view(B, 3, self.heads, D // self.heads).transpose(0, 1)
+        weight, bias = (torch.cat([rotate(p[:2], cos_sin), p[2:]]).mT.reshape(3 * D, -1) for p in (weight, bias))
+        q, k, v = F.linear(x, weight, bias[:, 0]).view(B, 3, self.heads, D // self.heads).unbind(1)
+        return q, k, v
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
         """Whole sequences (B, H, T, d); `mask` None means plain causal attention."""
@@ -401,9 +403,9 @@ class EnvironmentTransformer(nn.Module):
         groups = clusters(token, generator)
         self.random_features.fit(token, generator)
         mean, log_variance, _ = self.heads(hidden)
-        self.laplace.fit(self.features(hidden, token), target, mean, log_variance.exp(), groups)
+        self.laplace.fit(self.posterior_inputs(hidden, token), target, mean, log_variance.exp(), groups)
 
-    def features(self, hidden: Tensor, token: Tensor) -> Tensor:
+    def posterior_inputs(self, hidden: Tensor, token: Tensor) -> Tensor:
         """(..., P) what the posterior sees of hidden tokens (..., D) and the pairs (..., S + A) they end in."""
         assert self.random_features is not None
         return torch.cat([hidden.float(), self.random_features(token)], -1)
@@ -516,7 +518,7 @@ class EnvironmentTransformer(nn.Module):
         if epistemic_log_variance is not None:
             epistemic = epistemic_log_variance.exp()
         elif self.laplace is not None:
-            features = self.features(hidden, token)
+            features = self.posterior_inputs(hidden, token)
             leverage = self.laplace.leverage(features)
             epistemic, novelty = self.laplace.variance(leverage), leverage / self.laplace.limit
         aleatoric = log_variance.exp() * self.recalibration
