@@ -1,4 +1,4 @@
-"""What tells strange pairs from familiar ones: `python benchmarks/novelty.py --out OUT.json --robot hopper`.
+"""What tells strange pairs from familiar ones: `python benchmarks/novelty.py --out OUT.json --robots hopper ant`.
 
 First the posterior of the last layer, with more or fewer random features beside the hidden token. Then random-prior
 heads (Osband et al. 2018): ten small networks on the hidden token, each with a fixed random network of its own added,
@@ -7,10 +7,10 @@ judges, on the same pairs. The suite's transformer is taken from the work folder
 """
 
 import argparse
-import json
 import os
-import sys
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +20,11 @@ from torch import Tensor, nn
 from envtf_lit.calibration import CalibrationOptions, Course
 from envtf_lit.data.loaders import Windows
 from envtf_lit.evaluation.calibration import Points, auroc
-from envtf_lit.suite import WORK, SuiteOptions, build_suite
-from envtf_lit.tasks import ROBOTS, get_task
-from envtf_lit.world_models.lit import EPISTEMIC_TOKENS
+from envtf_lit.params import TrainModelOptions
+from envtf_lit.storage import write_json
+from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite, heading
+from envtf_lit.tasks import ROBOTS, Task, get_task
+from envtf_lit.world_models.lit import LitWorldModel, window_data
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
@@ -79,16 +81,16 @@ def train(
     return learner, prior
 
 
-def refit(model: EnvironmentTransformer, windows: Windows, count: int, seed: int) -> EnvironmentTransformer:
-    """The same network with a posterior that sees so many random features."""
-    other = EnvironmentTransformer(**model.arguments | {"random_features": count}).eval()
-    skipped = ("random_features.", "laplace.")
-    other.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith(skipped)}, strict=False)
-    generator = torch.Generator().manual_seed(seed)
-    tiles = windows.tiles()
-    tiles = tiles[torch.randperm(len(tiles), generator=generator)[: EPISTEMIC_TOKENS // model.options.context]]
-    other.fit_epistemic((windows[part] for part in tiles.split(256)), generator=generator)
-    return other
+def refit(model: EnvironmentTransformer, suite: Suite, count: int) -> EnvironmentTransformer:
+    """The same network with a posterior that sees so many random features, fitted as after training."""
+    options = TrainModelOptions(model=replace(model.options, random_features=count))
+    data = window_data(str(suite.dataset), options, seed=suite.options.seed)
+    data.setup("fit")
+    lit = LitWorldModel(model.observation_dim, model.action_dim, options, suite.options.seed)
+    anew = ("random_features.", "laplace.")
+    lit.model.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith(anew)}, strict=False)
+    lit.fit_uncertainty(data)
+    return lit.model.eval()
 
 
 @torch.no_grad()
@@ -113,10 +115,34 @@ def spread(
     return (learner(hidden) + weight * prior(token)).var(0).mean(-1).numpy()
 
 
+def measure(task: Task, suite: Suite, given: argparse.Namespace) -> Iterator[dict[str, float]]:
+    """One robot's numbers, kind by kind."""
+    model = load_world_model(suite.folders["transformer"])
+    assert isinstance(model, EnvironmentTransformer)
+    course = Course(task, suite, CalibrationOptions(), True)
+    for count in given.features:
+        other = refit(model, suite, count)
+        numbers, _ = course.detection(other)
+        numbers |= {"rank_correlation": course.rollouts(other)[0]["rank_correlation"]}
+        assert other.laplace is not None
+        numbers |= {"scale": float(other.laplace.scale), "milliseconds": milliseconds(other, course.familiar)}
+        yield {f"{task.robot.name}.features_{count}.{name}": value for name, value in numbers.items()}
+    windows = Windows(suite.split()[0], model.options.context)
+    for weight in given.weights:
+        begin = time.perf_counter()
+        learner, prior = train(model, windows, weight, torch.Generator().manual_seed(given.seed))
+        familiar = spread(model, learner, prior, weight, course.familiar)
+        numbers = {
+            f"auroc_{contrast}": auroc(familiar, spread(model, learner, prior, weight, points))
+            for contrast, points in course.strange.items()
+        } | {"seconds": round(time.perf_counter() - begin, 1)}
+        yield {f"{task.robot.name}.priors_{weight:g}.{name}": value for name, value in numbers.items()}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON")
-    parser.add_argument("--robot", choices=ROBOTS, default="hopper")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON, written as it grows")
+    parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS))
     parser.add_argument("--tier", default="medium")
     parser.add_argument("--work", type=Path, default=WORK, metavar="DIR")
     parser.add_argument("--transitions", type=int, default=100_000)
@@ -128,31 +154,14 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     options = SuiteOptions(transitions=given.transitions, updates=given.updates, seed=given.seed, threads=given.threads)
-    task = get_task(f"{given.robot}-{given.tier}")
-    suite = build_suite(task.name, given.work, options, models=("transformer",))
-    model = load_world_model(suite.folders["transformer"])
-    assert isinstance(model, EnvironmentTransformer)
-    course = Course(task, suite, CalibrationOptions(), True)
-    windows = Windows(suite.split()[0], model.options.context)
-    result: dict[str, object] = {name: value for name, value in vars(given).items() if name not in ("out", "work")}
-    for count in given.features:
-        other = refit(model, windows, count, given.seed)
-        numbers, _ = course.detection(other)
-        numbers |= {"rank_correlation": course.rollouts(other)[0]["rank_correlation"]}
-        assert other.laplace is not None
-        numbers |= {"scale": float(other.laplace.scale), "milliseconds": milliseconds(other, course.familiar)}
-        result |= {f"features_{count}.{name}": value for name, value in numbers.items()}
-    for weight in given.weights:
-        begin = time.perf_counter()
-        learner, prior = train(model, windows, weight, torch.Generator().manual_seed(given.seed))
-        familiar = spread(model, learner, prior, weight, course.familiar)
-        for contrast, points in course.strange.items():
-            strange = spread(model, learner, prior, weight, points)
-            result[f"priors_{weight:g}.auroc_{contrast}"] = auroc(familiar, strange)
-        result[f"priors_{weight:g}.seconds"] = round(time.perf_counter() - begin, 1)
-    text = json.dumps(result, indent=2) + "\n"
-    given.out.write_text(text)
-    sys.stdout.write(text)
+    result = heading(given.tier, options, calibration=CalibrationOptions())
+    for robot in given.robots:
+        task = get_task(f"{robot}-{given.tier}")
+        suite = build_suite(task.name, given.work, options, models=("transformer",))
+        for numbers in measure(task, suite, given):
+            result |= numbers
+            write_json(given.out, result)
+            print(numbers)
 
 
 if __name__ == "__main__":
