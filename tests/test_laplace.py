@@ -71,6 +71,20 @@ def random_features(x: Tensor, count: int, seed: int = 0) -> RandomFeatures:
     return random
 
 
+def test_draws_vary_the_hidden_tokens_weights_alone():
+    generator = torch.Generator().manual_seed(0)
+    hidden, further = (torch.randn(500, n, generator=generator).double() for n in (6, 9))
+    groups, mean, noise = torch.arange(500) % 5, torch.zeros(500, 2).double(), torch.ones(500, 2).double()
+    alone, both = LastLayerLaplace(6, 2).double(), LastLayerLaplace(6, 2, further=9).double()
+    alone.fit(hidden, hidden[:, :2], mean, noise, groups)
+    both.fit(torch.cat([hidden, further], 1), hidden[:, :2], mean, noise, groups)
+    both.scale.copy_(alone.scale)
+    drawn = both.draw(500, generator)
+    assert drawn.shape == (500, 7, 2)
+    torch.testing.assert_close(both.deviation(hidden, drawn), alone.deviation(hidden, drawn))
+    assert (both.leverage(torch.cat([hidden, further], 1)) > alone.leverage(hidden)).all()
+
+
 def test_random_features_tell_apart_what_the_hidden_token_confuses():
     """The hidden token knows the first of two inputs alone; strange pairs differ in the second."""
     torch.manual_seed(0)

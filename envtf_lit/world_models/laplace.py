@@ -7,7 +7,7 @@ The last layer, though, is a linear regression on the hidden token, and for that
 A network may map strange inputs onto familiar hidden tokens, since nothing in training asked it to tell them apart. So
 the regression is given random features of the input beside them, which keep apart what differs. Its posterior is as
 wide as an ensemble of linear heads on all of them, with random priors (Osband et al. 2018), would be. Its mean is not
-used: predictions are the trained head's, and draws deviate from these.
+used: predictions are the trained head's, and draws vary this head's own weights alone.
 """
 
 from itertools import pairwise
@@ -69,8 +69,13 @@ class RandomFeatures(nn.Module):
 class LastLayerLaplace(nn.Module):
     """`S_eu(x) = c diag(R) q(x)` with the leverage `q = phi^T (Phi^T Phi + lambda I)^-1 phi`, phi = [1, features].
 
-    Features are what the last layer sees or might have seen: the hidden token, and random features of its input. Until
-    `fit` it knows no data and says zero.
+    Features are what the last layer sees, the hidden token, and behind it what it might have seen, random features.
+    Until `fit` it knows no data and says zero.
+
+    Args:
+        width: D, of the hidden token.
+        outputs: K.
+        further: features behind the hidden token; P = D + further in all.
 
     Attributes:
         root: (P + 1, P + 1) W, lower-triangular, with `W^T W = (Phi^T Phi + lambda I)^-1`, so that `q = |W phi|^2`.
@@ -84,9 +89,10 @@ class LastLayerLaplace(nn.Module):
     scale: Tensor
     limit: Tensor
 
-    def __init__(self, features: int, outputs: int) -> None:
+    def __init__(self, width: int, outputs: int, further: int = 0) -> None:
         super().__init__()
-        self.register_buffer("root", torch.zeros(features + 1, features + 1))
+        self.width = width
+        self.register_buffer("root", torch.zeros(width + further + 1, width + further + 1))
         self.register_buffer("residual", torch.zeros(outputs))
         self.register_buffer("scale", torch.zeros(()))
         self.register_buffer("limit", torch.ones(()))
@@ -109,14 +115,23 @@ class LastLayerLaplace(nn.Module):
         return self.scale * leverage[..., None] * self.residual
 
     def draw(self, count: int, generator: torch.Generator | None = None) -> Tensor:
-        """Last layers drawn from the posterior, as deviations from the trained one: (count, P + 1, K) on q's root."""
-        size = (count, len(self.root), len(self.residual))
+        """Last layers drawn from the posterior, as deviations from the trained one: (count, D + 1, K) on q's root.
+
+        Of the hidden token's weights, given that those of further features are zero, as they are in the model:
+        functions of random features are rough, and the gradient of a return through them misleads an actor.
+        """
+        size = (count, self.width + 1, len(self.residual))
         return torch.randn(size, generator=generator, device=self.root.device, dtype=self.root.dtype)
 
-    def deviation(self, features: Tensor, drawn: Tensor) -> Tensor:
-        """What drawn last layers (B, P + 1, K) add to the mean at features (B, P): (B, K), with variance S_eu."""
-        whitened = torch.cat(self._whitened(features), -1)
-        sums = self.root[0, 0] * drawn[:, 0] + torch.einsum("bp,bpk->bk", whitened, drawn[:, 1:])
+    def deviation(self, hidden: Tensor, drawn: Tensor) -> Tensor:
+        """What drawn last layers (B, D + 1, K) add to the mean at hidden tokens (B, D): (B, K).
+
+        Its variance is S_eu as the hidden token alone would have it, whose root is the head of W.
+        """
+        with torch.autocast(hidden.device.type, enabled=False):
+            own = self.root[1 : self.width + 1, : self.width + 1]
+            whitened = F.linear(hidden.to(own.dtype), own[:, 1:], own[:, 0])
+            sums = self.root[0, 0] * drawn[:, 0] + torch.einsum("bd,bdk->bk", whitened, drawn[:, 1:])
         return sums * (self.scale * self.residual).sqrt()
 
     def fit(self, features: Tensor, targets: Tensor, mean: Tensor, aleatoric: Tensor, groups: Tensor) -> None:

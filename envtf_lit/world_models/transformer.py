@@ -180,7 +180,7 @@ class TransformerState:
         clock: position of the next token, the same for all rows (histories are right-aligned).
         first: (B,) position of each row's first token, or None where all rows began at 0.
         observation: (B, S) current observation.
-        drawn: (B, P + 1, S + 1) each row's last layer, drawn from the posterior; None where all use the trained one.
+        drawn: (B, D + 1, S + 1) each row's last layer, drawn from the posterior; None where all use the trained one.
     """
 
     cache: list[tuple[Tensor, Tensor]]
@@ -239,7 +239,7 @@ class EnvironmentTransformer(nn.Module):
         if self.options.epistemic == "laplace":
             count = self.options.random_features
             self.random_features = RandomFeatures(observation_dim + action_dim, count)
-            self.laplace = LastLayerLaplace(width + count, observation_dim + 1)
+            self.laplace = LastLayerLaplace(width, observation_dim + 1, further=count)
 
     def _stack(self) -> list[Block]:
         return cast(list[Block], list(self.blocks))
@@ -509,25 +509,23 @@ class EnvironmentTransformer(nn.Module):
     ) -> Prediction:
         """Last hidden tokens (..., D) of pairs (..., S + A), as normalised, in states (..., S), to a `Prediction`.
 
-        With drawn last layers (B, P + 1, S + 1) outcomes follow those, and differ by aleatoric noise alone; `log_prob`
+        With drawn last layers (B, D + 1, S + 1) outcomes follow those, and differ by aleatoric noise alone; `log_prob`
         is under the whole distribution nevertheless.
         """
         scale = self.normaliser.target_std
         mean, log_variance, epistemic_log_variance = self.heads(hidden)
-        features, epistemic, novelty = None, None, None
+        epistemic, novelty = None, None
         if epistemic_log_variance is not None:
             epistemic = epistemic_log_variance.exp()
         elif self.laplace is not None:
-            features = self.posterior_inputs(hidden, token)
-            leverage = self.laplace.leverage(features)
+            leverage = self.laplace.leverage(self.posterior_inputs(hidden, token))
             epistemic, novelty = self.laplace.variance(leverage), leverage / self.laplace.limit
         aleatoric = log_variance.exp() * self.recalibration
         epistemic = None if epistemic is None else epistemic * self.recalibration
         variance = aleatoric if epistemic is None else aleatoric + epistemic
         value, spread = mean, variance
         if drawn is not None:
-            assert features is not None
-            deviation = self._posterior().deviation(features, drawn)
+            deviation = self._posterior().deviation(hidden.float(), drawn)
             value, spread = mean + deviation * self.recalibration.sqrt(), aleatoric
         if mode == "sample":
             noise = stretch(torch.empty_like(mean).normal_(generator=generator), self.tail)
