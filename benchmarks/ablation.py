@@ -11,11 +11,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from envtf_lit.horizon import HorizonOptions, compare
-from envtf_lit.params import ModelOptions, TrainModelOptions
-from envtf_lit.storage import write_json
-from envtf_lit.suite import WORK, SuiteOptions, add_model, build_suite
-from envtf_lit.tasks import ROBOTS
+from envtf_lit.files import write_json
+from envtf_lit.robots.tasks import ROBOTS
+from envtf_lit.studies.horizon import HorizonOptions, compare
+from envtf_lit.studies.suite import WORK, SuiteOptions, add_model, build_suite
+from envtf_lit.world_models.options import ModelOptions, TrainModelOptions
 
 TOKENS = TrainModelOptions().batch_size * ModelOptions().context  # steps of each update
 

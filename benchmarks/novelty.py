@@ -17,14 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from envtf_lit.calibration import CalibrationOptions, Course
 from envtf_lit.data.loaders import Windows
 from envtf_lit.evaluation.calibration import Points, auroc
-from envtf_lit.params import TrainModelOptions
-from envtf_lit.storage import write_json
-from envtf_lit.suite import WORK, Suite, SuiteOptions, build_suite, heading
-from envtf_lit.tasks import ROBOTS, Task, get_task
+from envtf_lit.files import write_json
+from envtf_lit.robots.tasks import ROBOTS, Task, get_task
+from envtf_lit.studies.calibration import CalibrationOptions, Course
+from envtf_lit.studies.suite import WORK, Suite, SuiteOptions, build_suite, heading
 from envtf_lit.world_models.lit import LitWorldModel, window_data
+from envtf_lit.world_models.options import TrainModelOptions
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 

@@ -4,12 +4,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from envtf_lit.data.formats import load_dataset
+    from envtf_lit.data.sources.files import load_dataset
     from envtf_lit.policy import load_policy
     from envtf_lit.world_models.store import load_world_model
 
 _EXPORTS = {
-    "load_dataset": "envtf_lit.data.formats",
+    "load_dataset": "envtf_lit.data.sources.files",
     "load_policy": "envtf_lit.policy",
     "load_world_model": "envtf_lit.world_models.store",
 }

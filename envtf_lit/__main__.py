@@ -1,5 +1,5 @@
 """`python -m envtf_lit` is `envtf`."""
 
-from envtf_lit.cli import main
+from envtf_lit.cli.main import main
 
 main()

@@ -15,8 +15,8 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, R
 from torch import nn
 
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.params import Precision
-from envtf_lit.storage import replacing
+from envtf_lit.files import replacing, write_json
+from envtf_lit.options.schema import Precision
 
 logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # says what hardware there is at every fit
 RUNS = Path(".envtf/runs")
@@ -152,3 +152,13 @@ def freeze(module: nn.Module, parts: Sequence[str]) -> None:
 def autocast(device: torch.device, precision: Precision) -> torch.autocast:
     """bf16 matrix products where the parameters ask for them."""
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
+
+
+CURVES = "curves.csv"  # below every model
+
+
+def record_training(folder: Path, metrics: dict[str, Any], settings: dict[str, Any], curves: Any) -> None:
+    """Metrics, resolved options and curves beside the weights."""
+    write_json(folder / "metrics.json", metrics)
+    write_json(folder / "resolved.json", settings)
+    curves.write(folder / CURVES)

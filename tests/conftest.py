@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from envtf_lit.config import params_yaml, preset_params
+from envtf_lit.pipeline.yaml import params_yaml, preset_params
 
 torch.set_num_threads(1)
 

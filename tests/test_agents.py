@@ -10,10 +10,11 @@ from torch import nn
 
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.networks import StackedCritics
+from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.ring import ImaginedRing
 from envtf_lit.errors import UserError
-from envtf_lit.imagination import Rollouts
-from envtf_lit.params import ImaginationOptions, PolicyOptions
+from envtf_lit.imagination.options import ImaginationOptions
+from envtf_lit.imagination.rollouts import Rollouts
 from envtf_lit.policy import TanhGaussianActor
 
 S, A, B = 3, 2, 8

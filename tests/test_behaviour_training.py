@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from envtf_lit import behaviour_training
-from envtf_lit.behaviour_training import RECIPES, RENORM_EPSILON, _stretch, flax_to_torch, settle, train
-from envtf_lit.cli import main
-from envtf_lit.data.behaviour import ZOO, Series, collect, load_snapshot, read_series
+from envtf_lit.cli.main import main
 from envtf_lit.errors import UserError
 from envtf_lit.policy import TanhGaussianActor
-from envtf_lit.tasks import ROBOTS, get_task
+from envtf_lit.robots.tasks import ROBOTS, get_task
+from envtf_lit.zoo import train as behaviour_training
+from envtf_lit.zoo.collect import collect
+from envtf_lit.zoo.snapshots import ZOO, Series, load_snapshot, read_series
+from envtf_lit.zoo.train import RECIPES, RENORM_EPSILON, _stretch, flax_to_torch, settle, train
 
 HOPPER = ROBOTS["hopper"]
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from envtf_lit.bench.cost import _plain, bench_cost
-from envtf_lit.bench.speed import _training, bench_model
-from envtf_lit.cli import _suite_options, build_parser, main
-from envtf_lit.machine import in_turns, ratio, typical
-from envtf_lit.params import EnsembleOptions, ModelOptions, TrainModelOptions
-from envtf_lit.suite import SuiteOptions
-from envtf_lit.tasks import ROBOTS
+from envtf_lit.cli.main import _suite_options, build_parser, main
+from envtf_lit.robots.tasks import ROBOTS
+from envtf_lit.studies.cost import _plain, bench_cost
+from envtf_lit.studies.machine import in_turns, ratio, typical
+from envtf_lit.studies.speed import _training, bench_model
+from envtf_lit.studies.suite import SuiteOptions
 from envtf_lit.world_models.ensemble import EnsembleDynamics
+from envtf_lit.world_models.options import EnsembleOptions, ModelOptions, TrainModelOptions
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 RATIOS = (

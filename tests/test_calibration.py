@@ -10,11 +10,11 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from envtf_lit import calibration
-from envtf_lit.calibration import CONTRASTS, CalibrationOptions
 from envtf_lit.errors import UserError
-from envtf_lit.params import EnsembleOptions
-from envtf_lit.suite import MODELS, SuiteOptions, add_model, build_suite, model_params
+from envtf_lit.studies import calibration
+from envtf_lit.studies.calibration import CONTRASTS, CalibrationOptions
+from envtf_lit.studies.suite import MODELS, SuiteOptions, add_model, build_suite, model_params
+from envtf_lit.world_models.options import EnsembleOptions
 
 ENSEMBLE = EnsembleOptions(
     members=3, elites=2, hidden=(8,), weight_decay=(0.0, 0.0), updates=4, updates_per_epoch=2, batch_size=8

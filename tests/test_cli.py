@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from envtf_lit import pipeline
-from envtf_lit.behaviour_training import RECIPES
-from envtf_lit.cli import LIGHTNING, STAGES, flags_to_overrides, main
-from envtf_lit.config import dump_params, load_params, params_yaml, preset_params
-from envtf_lit.data.formats import load_dataset
+from envtf_lit.cli.main import LIGHTNING, STAGES, flags_to_overrides, main
+from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.tasks import ROBOTS
+from envtf_lit.pipeline.stage import ALGORITHMS
+from envtf_lit.pipeline.yaml import dump_params, load_params, params_yaml, preset_params
+from envtf_lit.robots.tasks import ROBOTS
+from envtf_lit.zoo.train import RECIPES
 
 COMMANDS = [*STAGES, "init", "params", "doctor"]
 
@@ -59,7 +59,7 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "known"),
     [
-        (["train_policy", "?"], pipeline.ALGORITHMS),
+        (["train_policy", "?"], ALGORITHMS),
         (["zoo", "train", "--robot", "?"], ROBOTS),
         (["zoo", "train", "--algorithm", "?"], RECIPES),
         (["hidden", "--robots", "?"], ROBOTS),
@@ -123,7 +123,7 @@ def test_an_interrupt_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys:
     def interrupted(arguments: list[str]) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("envtf_lit.cli._run", interrupted)
+    monkeypatch.setattr("envtf_lit.cli.main._run", interrupted)
     assert exit_status(["train_model"]) == 130
     assert "continues" in capsys.readouterr().err
 

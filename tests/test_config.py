@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from envtf_lit.config import PRESETS, describe, dump_params, load_params, meanings, params_yaml, preset_params
 from envtf_lit.errors import UserError
-from envtf_lit.params import Params
-from envtf_lit.validation import RANGES, build_params
+from envtf_lit.options.schema import RANGES
+from envtf_lit.pipeline.params import Params, build_params
+from envtf_lit.pipeline.yaml import PRESETS, describe, dump_params, load_params, meanings, params_yaml, preset_params
 
 
 def options_classes(cls: type = Params) -> set[type]:

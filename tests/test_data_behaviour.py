@@ -8,24 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from envtf_lit.data.behaviour import (
-    ENVIRONMENTS,
-    UNIT_ROWS,
-    ZOO,
-    Phase,
-    _collect_unit,
-    _units,
-    collect,
-    describe_origin,
-    load_snapshot,
-    plan,
-    read_series,
-)
 from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
-from envtf_lit.data.formats import save_dataset
+from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.evaluation.returns import evaluate_policy
-from envtf_lit.tasks import ROBOTS, TASKS, TIERS, Robot, get_task
+from envtf_lit.robots.returns import evaluate_policy
+from envtf_lit.robots.tasks import ROBOTS, TASKS, TIERS, Robot, get_task
+from envtf_lit.zoo.collect import ENVIRONMENTS, UNIT_ROWS, _collect_unit, _units, collect
+from envtf_lit.zoo.snapshots import ZOO, Phase, describe_origin, load_snapshot, plan, read_series
 
 TASK = get_task("hopper-medium-replay")
 ROWS = 2_000
@@ -112,7 +101,7 @@ def test_bytes_do_not_depend_on_the_number_of_processes(tmp_path: Path):
 
 
 def test_a_dataset_of_many_units_does_not_depend_on_their_order(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("envtf_lit.data.behaviour.UNIT_ROWS", 100)
+    monkeypatch.setattr("envtf_lit.zoo.collect.UNIT_ROWS", 100)
     task = get_task("hopper-medium-expert")
     forwards = collect(task, 240, seed=0, workers=1, progress=False)
     monkeypatch.setattr("envtf_lit.data.behaviour.sorted", lambda jobs, key: list(jobs)[::-1], raising=False)

@@ -5,7 +5,7 @@ import pytest
 
 from envtf_lit.data.cards import card_page, counted_episodes, cut_short, dataset_card
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.tasks import ROBOTS
+from envtf_lit.robots.tasks import ROBOTS
 
 LENGTHS, FELL = (1000, 400, 300, 999), (False, True, False, False)  # the last two are cut short
 

@@ -10,16 +10,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from walker import walker_dataset
 
-from envtf_lit import pipeline
-from envtf_lit.config import preset_params
 from envtf_lit.data.columns import FileRows, column_blocks, moments
 from envtf_lit.data.dataset import COLUMNS
-from envtf_lit.data.formats import load_dataset, save_dataset
 from envtf_lit.data.inspection import inspect_source
 from envtf_lit.data.loaders import Store, Transitions, Windows
+from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.imagination import BranchPoints
-from envtf_lit.storage import pick_device
+from envtf_lit.files import pick_device
+from envtf_lit.imagination.histories import BranchPoints
+from envtf_lit.pipeline.generate_rollouts import generate_rollouts
+from envtf_lit.pipeline.train_model import train_model
+from envtf_lit.pipeline.train_policy import train_policy
+from envtf_lit.pipeline.yaml import preset_params
 
 WIDE = ("observations", "actions", "next_observations")
 
@@ -83,7 +85,7 @@ def test_moments_of_blocks_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatc
 @pytest.fixture
 def in_file(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """Every file counts as a large one."""
-    monkeypatch.setattr("envtf_lit.data.formats.RESIDENT_BYTES", 0)
+    monkeypatch.setattr("envtf_lit.data.sources.files.RESIDENT_BYTES", 0)
     return monkeypatch
 
 
@@ -180,9 +182,9 @@ def train(root: Path) -> dict[str, bytes]:
             ),
         ),
     )
-    pipeline.train_model(params, root, progress=False)
-    pipeline.generate_rollouts(params, root, progress=False)
-    pipeline.train_policy(params, root, algorithm="et_cql", progress=False)
+    train_model(params, root, progress=False)
+    generate_rollouts(params, root, progress=False)
+    train_policy(params, root, algorithm="et_cql", progress=False)
     folders = ("world_model", "behaviour", "policy/et_cql")
     weights = {name: (root / "models" / name / "weights.safetensors").read_bytes() for name in folders}
     return weights | {"rollouts": (root / "data/rollouts.h5").read_bytes()}
@@ -193,6 +195,6 @@ def test_every_stage_learns_the_same_bits_from_memory_and_from_the_file(tmp_path
     save_dataset(walker_dataset(), tmp_path / "data/dataset.h5")
     assert isinstance(load_dataset(tmp_path / "data/dataset.h5").observations, FileRows)
     from_file = train(tmp_path)
-    in_file.setattr("envtf_lit.data.formats.RESIDENT_BYTES", 1 << 30)
+    in_file.setattr("envtf_lit.data.sources.files.RESIDENT_BYTES", 1 << 30)
     assert isinstance(load_dataset(tmp_path / "data/dataset.h5").observations, np.ndarray)
     assert train(tmp_path) == from_file

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from web import Server, serving
 
-from envtf_lit.data import d4rl
 from envtf_lit.data.cards import counted_episodes, dataset_card
-from envtf_lit.data.d4rl import FILES, load_d4rl, read_d4rl, remote_file
-from envtf_lit.data.fetch import RemoteFile
-from envtf_lit.data.sources import make_dataset
+from envtf_lit.data.options import DownloadOptions
+from envtf_lit.data.sources import d4rl
+from envtf_lit.data.sources.d4rl import FILES, load_d4rl, read_d4rl, remote_file
+from envtf_lit.data.sources.fetch import RemoteFile
 from envtf_lit.errors import UserError
-from envtf_lit.params import DownloadOptions
-from envtf_lit.tasks import TASKS, get_task
+from envtf_lit.pipeline.sources import make_dataset
+from envtf_lit.robots.tasks import TASKS, get_task
 
 HOPPER, ANT = get_task("hopper-medium-v4"), get_task("ant-medium-v4")
 Columns = dict[str, np.ndarray]

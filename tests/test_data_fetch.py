@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from web import Server, serving
 
-from envtf_lit.data.fetch import ATTEMPTS, PIECE, RemoteFile, fetch
+from envtf_lit.data.sources.fetch import ATTEMPTS, PIECE, RemoteFile, fetch
 from envtf_lit.errors import UserError
 
 P = PIECE  # connections break between two pieces, so that the tests can count
@@ -85,7 +85,7 @@ def test_the_next_call_continues_what_an_interrupted_one_left(serve: Serve, tmp_
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("envtf_lit.data.fetch.time.sleep", interrupt)
+        patch.setattr("envtf_lit.data.sources.fetch.time.sleep", interrupt)
         with pytest.raises(KeyboardInterrupt):
             get(whole, tmp_path / "some.hdf5")
     assert not (tmp_path / "some.hdf5").exists()
@@ -169,7 +169,9 @@ def test_every_server_is_named(serve: Serve, tmp_path: Path) -> None:
 
 def test_a_full_disk_is_seen_before_the_download(serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here = serve(server())
-    monkeypatch.setattr("envtf_lit.data.fetch.shutil.disk_usage", lambda _: type("Usage", (), {"free": 2_999_999}))
+    monkeypatch.setattr(
+        "envtf_lit.data.sources.fetch.shutil.disk_usage", lambda _: type("Usage", (), {"free": 2_999_999})
+    )
     with pytest.raises(UserError, match=r"No space left in .* while downloading some.hdf5 \(3 MB\)"):
         get(remote(here), tmp_path / "some.hdf5")
     assert here.asked == []
@@ -179,7 +181,7 @@ def test_a_disk_that_fills_up(serve: Serve, tmp_path: Path, monkeypatch: pytest.
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("envtf_lit.data.fetch.os.replace", full)
+    monkeypatch.setattr("envtf_lit.data.sources.fetch.os.replace", full)
     with pytest.raises(UserError, match="No space left"):
         get(remote(serve(server())), tmp_path / "some.hdf5")
     assert not (tmp_path / "some.hdf5").exists()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from logs import assert_equal, columns, write
 
-from envtf_lit.data.formats import load_dataset, save_dataset
+from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.errors import UserError
 
 

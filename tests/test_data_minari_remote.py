@@ -12,7 +12,7 @@ import huggingface_hub.constants
 import pytest
 from logs import dataset_of_chains
 
-from envtf_lit.data.minari_sets import read_minari, write_minari
+from envtf_lit.data.sources.minari import read_minari, write_minari
 from envtf_lit.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("minari_root")

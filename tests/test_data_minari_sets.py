@@ -17,9 +17,9 @@ from minari.data_collector.episode_buffer import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
 from envtf_lit.data.dataset import COLUMNS
-from envtf_lit.data.minari_sets import describe_minari, read_minari, write_minari
+from envtf_lit.data.sources.minari import describe_minari, read_minari, write_minari
 from envtf_lit.errors import UserError
-from envtf_lit.hidden_dynamics import HiddenDynamics
+from envtf_lit.robots.hidden_dynamics import HiddenDynamics
 
 pytestmark = pytest.mark.usefixtures("minari_root")
 PLAIN = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)

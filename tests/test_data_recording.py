@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from envtf_lit.data.recording import _Log
-from envtf_lit.tasks import ROBOTS
+from envtf_lit.robots.tasks import ROBOTS
+from envtf_lit.zoo.record import _Log
 
 
 def log_of(endings: Sequence[Sequence[str]]) -> _Log:

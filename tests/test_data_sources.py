@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envtf_lit.data.behaviour import collect
 from envtf_lit.data.cards import counted_episodes, dataset_card
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.formats import save_dataset
-from envtf_lit.data.minari_sets import write_minari
-from envtf_lit.data.sources import make_dataset
+from envtf_lit.data.options import DownloadOptions
+from envtf_lit.data.sources.files import save_dataset
+from envtf_lit.data.sources.minari import write_minari
 from envtf_lit.errors import UserError
-from envtf_lit.params import DownloadOptions
-from envtf_lit.tasks import get_task
+from envtf_lit.pipeline.sources import make_dataset
+from envtf_lit.robots.tasks import get_task
+from envtf_lit.zoo.collect import collect
 
 TASK = get_task("hopper-medium-replay")
 ZOO = DownloadOptions(source="zoo", transitions=300)

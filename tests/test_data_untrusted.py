@@ -16,8 +16,8 @@ from logs import KEYS, Columns, columns, write
 from rich.console import Console
 
 from envtf_lit.data.dataset import COLUMNS
-from envtf_lit.data.formats import load_dataset
 from envtf_lit.data.inspection import inspect_source, render
+from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
 
 
@@ -118,7 +118,7 @@ def test_absurd_sizes_end_in_a_sentence_before_any_memory_is_taken(tmp_path: Pat
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 48,)})
     with zipfile.ZipFile(write(tmp_path / "header.npz", content), "a") as archive:
         archive.writestr("rewards.npy", header.getvalue() + bytes(96))
-    monkeypatch.setattr("envtf_lit.data.formats.BOMB_BYTES", 1 << 20)
+    monkeypatch.setattr("envtf_lit.data.sources.files.BOMB_BYTES", 1 << 20)
     np.savez_compressed(tmp_path / "zeros.npz", allow_pickle=False, **content, rewards=np.zeros(1 << 20))
     for name, message in (
         ("bomb.h5", "a trap"),
@@ -211,7 +211,7 @@ def malformed(draw: st.DrawFn, path: Path) -> None:
 def check_ends_in_a_report(path: Path, data: st.DataObject) -> None:
     """Of a small file, or of one whose columns stay there because it counts as large."""
     data.draw(malformed(path))
-    with mock.patch("envtf_lit.data.formats.RESIDENT_BYTES", data.draw(st.sampled_from([0, 1 << 28]))):
+    with mock.patch("envtf_lit.data.sources.files.RESIDENT_BYTES", data.draw(st.sampled_from([0, 1 << 28]))):
         check_report_and_loading(path)
 
 

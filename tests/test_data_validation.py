@@ -8,8 +8,8 @@ import pytest
 from logs import Columns
 from logs import columns as file_columns
 
+from envtf_lit.data.checks import Finding, build_dataset, examine
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.validation import Finding, build_dataset, examine
 from envtf_lit.errors import UserError
 
 ATTRIBUTES = ("task", "action_low", "action_high")

@@ -10,13 +10,15 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from envtf_lit import load_world_model, pipeline
-from envtf_lit.data.formats import save_dataset
+from envtf_lit import load_world_model
 from envtf_lit.data.loaders import Resamples, Windows
+from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.params import EnsembleOptions, Params, TrainModelOptions
+from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.train_model import train_model
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.lit import LitEnsemble
+from envtf_lit.world_models.options import EnsembleOptions, TrainModelOptions
 from envtf_lit.world_models.store import save_world_model
 from tests.test_training import Killed, bytes_of, kill_in_epoch
 from tests.walker import walker_dataset
@@ -257,7 +259,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def train(root: Path, params: Params = TINY) -> dict[str, bytes]:
-    pipeline.train_model(params, root, progress=False)
+    train_model(params, root, progress=False)
     return bytes_of(root / "models/world_model")
 
 
@@ -287,7 +289,7 @@ def test_a_killed_run_resumes_to_the_same_bits(root, monkeypatch):
 
 def test_training_stops_when_no_member_improves(root):
     stopping = with_options(updates=400, learning_rate=1e-12, patience=2)
-    metrics = pipeline.train_model(stopping, root, progress=False)
+    metrics = train_model(stopping, root, progress=False)
     assert metrics["epoch"] == 3  # the first sets the errors to beat, two more do not
 
 

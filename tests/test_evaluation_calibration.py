@@ -24,9 +24,9 @@ from envtf_lit.evaluation.calibration import (
     rollout_errors,
     with_uniform_actions,
 )
-from envtf_lit.tasks import never_terminated
-from envtf_lit.world_models.horizon import Scale, forecast, whole_episodes
-from envtf_lit.world_models.recalibration import normal_scores
+from envtf_lit.robots.tasks import never_terminated
+from envtf_lit.world_models.forecast import Scale, forecast, whole_episodes
+from envtf_lit.world_models.uncertainty.recalibration import normal_scores
 
 NOISE = 0.05
 

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from analytic import linear_data, linear_world
 
-from envtf_lit.evaluation.evidence import collect_metrics, dataset_scores, world_model_metrics
-from envtf_lit.evaluation.returns import Episode, Returns
-from envtf_lit.storage import read_json, write_json
-from envtf_lit.tasks import ROBOTS
-from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
+from envtf_lit.data.cards import dataset_scores
+from envtf_lit.evaluation.horizon import horizon_report
+from envtf_lit.evaluation.metrics import collect_metrics, world_model_metrics
+from envtf_lit.files import read_json, write_json
+from envtf_lit.robots.returns import Episode, Returns
+from envtf_lit.robots.tasks import ROBOTS
+from envtf_lit.world_models.forecast import Scale, whole_episodes
 
 
 def returns(values: list[float]) -> Returns:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from envtf_lit.data.behaviour import load_snapshot, read_series
 from envtf_lit.data.dataset import OfflineDataset, starts_from_ends
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.physics import Physics, ceiling, perturbed
-from envtf_lit.tasks import ROBOTS, Robot, get_task
-from envtf_lit.world_models.horizon import Scale, nmse, whole_episodes
+from envtf_lit.robots.tasks import ROBOTS, Robot, get_task
+from envtf_lit.world_models.forecast import Scale, nmse, whole_episodes
+from envtf_lit.zoo.snapshots import load_snapshot, read_series
 
 STEPS = 80
 

@@ -10,9 +10,9 @@ from analytic import LinearWorld, linear_data, linear_world
 from PIL import Image
 from torch import Tensor
 
-from envtf_lit.evaluation.recognition import HISTORY, Recognition, recognition, recognition_metrics, stretches
-from envtf_lit.figures.recognition import recognition_curves
-from envtf_lit.world_models.horizon import Scale
+from envtf_lit.evaluation.in_context import HISTORY, Recognition, recognition, recognition_metrics, stretches
+from envtf_lit.figures.in_context import recognition_curves
+from envtf_lit.world_models.forecast import Scale
 
 
 class Remembering(LinearWorld):

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from envtf_lit.errors import UserError
-from envtf_lit.evaluation.returns import ROWS, evaluate_policy
 from envtf_lit.policy import TanhGaussianActor
-from envtf_lit.tasks import ROBOTS
+from envtf_lit.robots.returns import ROWS, evaluate_policy
+from envtf_lit.robots.tasks import ROBOTS
 
 HOPPER = ROBOTS["hopper"]
 

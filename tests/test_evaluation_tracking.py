@@ -9,10 +9,11 @@ import torch
 from analytic import linear_data, linear_world
 
 from envtf_lit.evaluation import tracking
+from envtf_lit.evaluation.horizon import Steps
 from envtf_lit.evaluation.physics import Ceiling
 from envtf_lit.evaluation.tracking import fresh_episodes, track, track_ceiling, track_sampled
-from envtf_lit.tasks import ROBOTS, Task, get_task
-from envtf_lit.world_models.horizon import Scale, Steps, whole_episodes
+from envtf_lit.robots.tasks import ROBOTS, Task, get_task
+from envtf_lit.world_models.forecast import Scale, whole_episodes
 
 BRIEF_HOPPER = replace(ROBOTS["hopper"], max_episode_steps=50)
 

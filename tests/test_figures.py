@@ -11,11 +11,12 @@ import torch
 from analytic import linear_data, linear_world
 from PIL import Image
 
-from envtf_lit.evaluation.returns import Episode, Returns
+from envtf_lit.evaluation.horizon import horizon_report
 from envtf_lit.figures import gallery, learning
 from envtf_lit.figures.style import COLOURS, drawing, featured, model_looks, observation_labels
-from envtf_lit.tasks import ROBOTS
-from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
+from envtf_lit.robots.returns import Episode, Returns
+from envtf_lit.robots.tasks import ROBOTS
+from envtf_lit.world_models.forecast import Scale, whole_episodes
 
 HOPPER = ROBOTS["hopper"]
 WORLD_MODEL_CURVES = pd.DataFrame(

@@ -73,13 +73,14 @@ def lost_experiment(root: Path, source: str) -> Path:
     from PIL import Image
 
     from envtf_lit.data.cards import dataset_card
-    from envtf_lit.evaluation.evidence import collect_metrics, world_model_metrics
-    from envtf_lit.evaluation.returns import Episode, Returns
+    from envtf_lit.evaluation.horizon import horizon_report
+    from envtf_lit.evaluation.metrics import collect_metrics, world_model_metrics
     from envtf_lit.figures import gallery
     from envtf_lit.figures.video import write_gif
-    from envtf_lit.storage import write_json
-    from envtf_lit.tasks import ROBOTS
-    from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
+    from envtf_lit.files import write_json
+    from envtf_lit.robots.returns import Episode, Returns
+    from envtf_lit.robots.tasks import ROBOTS
+    from envtf_lit.world_models.forecast import Scale, whole_episodes
 
     hopper, data = ROBOTS["hopper"], linear_data((40, 50), noise=0.02)
     model_curves = pd.DataFrame({"epoch": [1], "train/loss": [1.0], "val/loss": [1.1], "val/open_loop_error": [0.2]})

@@ -7,11 +7,11 @@ from analytic import LinearWorld
 from PIL import Image
 
 from envtf_lit.errors import UserError
-from envtf_lit.evaluation.returns import Episode, evaluate_policy
 from envtf_lit.figures import video
 from envtf_lit.policy import RandomPolicy
-from envtf_lit.tasks import ROBOTS, Robot, get_task
-from envtf_lit.world_models.horizon import Scale
+from envtf_lit.robots.returns import Episode, evaluate_policy
+from envtf_lit.robots.tasks import ROBOTS, Robot, get_task
+from envtf_lit.world_models.forecast import Scale
 
 HOPPER = ROBOTS["hopper"]
 SCALE = Scale(torch.zeros(12), torch.ones(12), torch.ones(12, dtype=torch.bool))

@@ -10,11 +10,11 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from envtf_lit import hidden
 from envtf_lit.errors import UserError
-from envtf_lit.hidden import HiddenOptions
-from envtf_lit.params import EnsembleOptions
-from envtf_lit.suite import MODELS, Suite, SuiteOptions, build_suite
+from envtf_lit.studies import memory as hidden
+from envtf_lit.studies.memory import HiddenOptions
+from envtf_lit.studies.suite import MODELS, Suite, SuiteOptions, build_suite
+from envtf_lit.world_models.options import EnsembleOptions
 
 ENSEMBLE = EnsembleOptions(
     members=2, elites=1, hidden=(8,), weight_decay=(0.0, 0.0), updates=2, updates_per_epoch=2, batch_size=8

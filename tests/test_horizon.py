@@ -10,17 +10,18 @@ import pytest
 from matplotlib.axes import Axes
 from PIL import Image
 
-from envtf_lit import horizon, tasks
-from envtf_lit.cli import main
+from envtf_lit.cli.main import main
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation import tracking
 from envtf_lit.evaluation.tracking import fresh_episodes
 from envtf_lit.figures import horizons
 from envtf_lit.figures.style import LABELS
-from envtf_lit.horizon import ONLINE, SIZES, HorizonOptions, compare
-from envtf_lit.params import EnsembleOptions
-from envtf_lit.suite import MODELS, Suite, SuiteOptions, build_suite
-from envtf_lit.tasks import ROBOTS, Task
+from envtf_lit.robots import tasks
+from envtf_lit.robots.tasks import ROBOTS, Task
+from envtf_lit.studies import horizon
+from envtf_lit.studies.horizon import ONLINE, SIZES, HorizonOptions, compare
+from envtf_lit.studies.suite import MODELS, Suite, SuiteOptions, build_suite
+from envtf_lit.world_models.options import EnsembleOptions
 
 ENSEMBLE = EnsembleOptions(
     members=2, elites=1, hidden=(8,), weight_decay=(0.0, 0.0), updates=2, updates_per_epoch=2, batch_size=8

@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from envtf_lit.errors import UserError
-from envtf_lit.imagination import BranchPoints, NoisyPolicy, Rollouts, imagine, load_rollouts, save_rollouts
+from envtf_lit.imagination.histories import BranchPoints
+from envtf_lit.imagination.rollouts import NoisyPolicy, Rollouts, imagine
+from envtf_lit.imagination.store import load_rollouts, save_rollouts
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.analytic import linear_data, linear_world

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from envtf_lit.params import ModelOptions
-from envtf_lit.world_models.laplace import RIDGE, SPREAD, LastLayerLaplace, RandomFeatures, clusters
 from envtf_lit.world_models.objectives import beta_nll, paper_mse
+from envtf_lit.world_models.options import ModelOptions
+from envtf_lit.world_models.uncertainty.laplace import RIDGE, SPREAD, LastLayerLaplace, RandomFeatures, clusters
 
 
 def fitted(hidden: Tensor, targets: Tensor, *, groups: Tensor | None = None) -> LastLayerLaplace:

@@ -12,15 +12,21 @@ import pandas as pd
 import pytest
 import torch
 
-from envtf_lit import load_policy, load_world_model, pipeline
+from envtf_lit import load_policy, load_world_model
 from envtf_lit.agents.cql import CQL
-from envtf_lit.cli import main
-from envtf_lit.data.formats import load_dataset, save_dataset
+from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.cli.main import main
 from envtf_lit.data.loaders import TransitionData, Transitions
-from envtf_lit.data.minari_sets import write_minari
+from envtf_lit.data.sources.files import load_dataset, save_dataset
+from envtf_lit.data.sources.minari import write_minari
 from envtf_lit.errors import UserError
-from envtf_lit.params import Params, PolicyOptions
-from envtf_lit.storage import read_json
+from envtf_lit.files import read_json
+from envtf_lit.pipeline.download import download
+from envtf_lit.pipeline.evaluate import evaluate
+from envtf_lit.pipeline.generate_rollouts import generate_rollouts
+from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.stage import ALGORITHMS
+from envtf_lit.pipeline.train_policy import train_policy
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from tests.test_no_environment import own_log, own_params
 from tests.walker import walker_dataset
@@ -105,7 +111,7 @@ def test_the_pipeline_spends_no_time_on_validating_agents(folder: Path, monkeypa
     cql = PolicyOptions(updates=4, updates_per_epoch=2, updates_per_step=2, batch_size=8, hidden=(8,), warm_start=2)
     params = Params(threads=1)
     params = replace(params, train_policy=replace(params.train_policy, cql=cql))
-    metrics = pipeline.train_policy(params, algorithm="cql", progress=False)
+    metrics = train_policy(params, algorithm="cql", progress=False)
     assert "return_error" not in metrics
 
 
@@ -162,7 +168,7 @@ def test_model_fit_publishes_and_starts_from_published_weights(folder: Path) -> 
 def test_the_stages_take_what_fit_published(folder: Path) -> None:
     save_dataset(replace(own_log(), task=None), "log.npz")
     params = own_params(folder / "log.npz")
-    pipeline.download(params, progress=False)
+    download(params, progress=False)
     few = ["--model.options.updates=4", "--model.options.updates_per_epoch=1", "--model.options.learning_rate=0.1"]
     fit("model", "--config=finetune", *few, held_out=0.25)
     curves, metrics = pd.read_csv(".envtf/published/curves.csv"), read_json(".envtf/published/metrics.json")
@@ -171,16 +177,16 @@ def test_the_stages_take_what_fit_published(folder: Path) -> None:
     assert len(curves) == 4 and 0 <= metrics["termination_false_alarms"] <= 1
     Path("models/policy").mkdir(parents=True)
     Path(".envtf/published").rename("models/world_model")
-    pipeline.generate_rollouts(params, progress=False)
-    for name in pipeline.ALGORITHMS:
+    generate_rollouts(params, progress=False)
+    for name in ALGORITHMS:
         fit("agent")
         Path(".envtf/published").rename(Path("models/policy", name))
-    metrics = pipeline.evaluate(params, progress=False)
+    metrics = evaluate(params, progress=False)
     assert metrics["world_model"]["termination"] == "learned"
     assert Path("reports/plots/policy_curves.png").exists()
     Path("models/policy/cql/curves.csv").unlink()
     with pytest.raises(UserError, match=r"models/policy/cql has no curves\.csv"):
-        pipeline.evaluate(params, progress=False)
+        evaluate(params, progress=False)
 
 
 def another_robot() -> None:

@@ -10,15 +10,23 @@ import torch
 from analytic import linear_data, linear_world
 from reports import said
 
-from envtf_lit import pipeline
-from envtf_lit.config import preset_params
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.formats import load_dataset, save_dataset
+from envtf_lit.data.options import DownloadOptions
+from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.errors import UserError
+from envtf_lit.evaluation.horizon import horizon_report
 from envtf_lit.evaluation.offline import action_error, imagined_returns, judge
-from envtf_lit.params import DownloadOptions, ImaginationOptions, Params, ValueGradientOptions
-from envtf_lit.validation import check_rules
-from envtf_lit.world_models.horizon import Scale, horizon_report, whole_episodes
+from envtf_lit.imagination.options import ImaginationOptions, ValueGradientOptions
+from envtf_lit.pipeline.download import download
+from envtf_lit.pipeline.evaluate import evaluate
+from envtf_lit.pipeline.generate_rollouts import generate_rollouts
+from envtf_lit.pipeline.params import Params, check_rules
+from envtf_lit.pipeline.report import report
+from envtf_lit.pipeline.stage import ALGORITHMS
+from envtf_lit.pipeline.train_model import train_model
+from envtf_lit.pipeline.train_policy import train_policy
+from envtf_lit.pipeline.yaml import preset_params
+from envtf_lit.world_models.forecast import Scale, whole_episodes
 
 # by hand
 
@@ -130,12 +138,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Params]:
     save_dataset(replace(own_log(), task=None), root / "log.npz")
     params = own_params(root / "log.npz")
     check_rules(params)
-    pipeline.download(params, root, progress=False)
-    pipeline.train_model(params, root, progress=False)
-    pipeline.generate_rollouts(params, root, progress=False)
-    for algorithm in pipeline.ALGORITHMS:
-        pipeline.train_policy(params, root, algorithm=algorithm, progress=False)
-    pipeline.evaluate(params, root, progress=False)
+    download(params, root, progress=False)
+    train_model(params, root, progress=False)
+    generate_rollouts(params, root, progress=False)
+    for algorithm in ALGORITHMS:
+        train_policy(params, root, algorithm=algorithm, progress=False)
+    evaluate(params, root, progress=False)
     return root, params
 
 
@@ -178,7 +186,7 @@ def test_the_report_says_that_nobody_measured_a_return(finished: tuple[Path, Par
     root, params = finished
     (root / "notebooks").mkdir()
     (root / "notebooks/report.ipynb").write_bytes((repository / "notebooks/report.ipynb").read_bytes())
-    pipeline.report(params, root, progress=False)
+    report(params, root, progress=False)
     text = said(root / "reports/report.ipynb")
     assert "no simulator here, so nobody knows how any of them does" in text
     assert "a classifier learned from the log says so" in text
@@ -191,7 +199,7 @@ def test_a_null_task_overrides_the_files(tmp_path: Path):
     wide = replace(log, observations=np.zeros((300, 11), np.float32), next_observations=np.zeros((300, 11), np.float32),
                    actions=np.zeros((300, 3), np.float32), action_low=-np.ones(3), action_high=np.ones(3))  # fmt: skip
     save_dataset(wide, tmp_path / "log.h5")
-    pipeline.download(own_params(tmp_path / "log.h5"), tmp_path, progress=False)
+    download(own_params(tmp_path / "log.h5"), tmp_path, progress=False)
     assert load_dataset(tmp_path / "log.h5").task == "hopper-medium"
     assert load_dataset(tmp_path / "data/dataset.h5").task is None
 

@@ -5,10 +5,15 @@ import torch
 from analytic import linear_data
 from test_transformer import A, S, batch_of, make_model, one_step, sequences
 
-from envtf_lit.world_models.horizon import Trajectories, forecast
-from envtf_lit.world_models.recalibration import calibration_split, fitted_tail, normal_scores, variance_factor
-from envtf_lit.world_models.tails import MOST, half_width, log_density, normal_score, stretch
+from envtf_lit.world_models.forecast import Trajectories, forecast
 from envtf_lit.world_models.transformer import EnvironmentTransformer
+from envtf_lit.world_models.uncertainty.recalibration import (
+    calibration_split,
+    fitted_tail,
+    normal_scores,
+    variance_factor,
+)
+from envtf_lit.world_models.uncertainty.tails import MOST, half_width, log_density, normal_score, stretch
 
 
 def test_the_factor_by_hand():

@@ -12,8 +12,8 @@ from lightning.pytorch.strategies import FSDPStrategy
 from ruamel.yaml import YAML
 from safetensors.torch import load_file
 
-from envtf_lit.cli import main
-from envtf_lit.data.formats import save_dataset
+from envtf_lit.cli.main import main
+from envtf_lit.data.sources.files import save_dataset
 from tests.walker import walker_dataset
 
 MODEL = ["model.layers=1", "model.heads=2", "model.width=16", "model.context=4", "updates_per_epoch=3", "updates=6"]

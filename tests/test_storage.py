@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from envtf_lit.errors import UserError
-from envtf_lit.params import ModelOptions
+from envtf_lit.files import load_weights, replacing, write_json
 from envtf_lit.policy import TanhGaussianActor, load_policy, save_policy
-from envtf_lit.storage import load_weights, replacing, write_json
+from envtf_lit.world_models.options import ModelOptions
 from envtf_lit.world_models.store import load_world_model, save_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 

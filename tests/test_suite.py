@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from envtf_lit import load_world_model
-from envtf_lit import suite as suite_module
 from envtf_lit.errors import UserError
-from envtf_lit.params import EnsembleOptions, ModelOptions, TrainModelOptions
-from envtf_lit.suite import MODELS, SuiteOptions, add_model, build_suite, other_folders
-from envtf_lit.tasks import get_task
+from envtf_lit.robots.tasks import get_task
+from envtf_lit.studies import suite as suite_module
+from envtf_lit.studies.suite import MODELS, SuiteOptions, add_model, build_suite, other_folders
 from envtf_lit.world_models.ensemble import EnsembleDynamics
+from envtf_lit.world_models.options import EnsembleOptions, ModelOptions, TrainModelOptions
 from envtf_lit.world_models.store import save_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
@@ -70,7 +70,7 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(
     assert (suite.folders["transformer"] / "weights.safetensors").stat().st_mtime_ns > time
 
     calls = list[str]()
-    monkeypatch.setattr(suite_module.pipeline, "download", lambda *arguments, **options: calls.append("data"))
+    monkeypatch.setattr(suite_module, "download", lambda *arguments, **options: calls.append("data"))
     monkeypatch.setattr(suite_module, "_train", lambda *arguments: calls.append("model"))
     os.utime(record)
     card = tmp_path / "hopper-medium/data/dataset.json"

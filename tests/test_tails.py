@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from envtf_lit.world_models.tails import ANCHOR, crps, half_width, log_density, normal_score, stretch
+from envtf_lit.world_models.uncertainty.tails import ANCHOR, crps, half_width, log_density, normal_score, stretch
 
 TAILS = (0.0, 0.3, 1.0)
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from envtf_lit.errors import UserError
-from envtf_lit.hidden_dynamics import Factors, HiddenDynamics
-from envtf_lit.tasks import ROBOTS, TASKS, find_task, get_task
+from envtf_lit.robots.hidden_dynamics import Factors, HiddenDynamics
+from envtf_lit.robots.tasks import ROBOTS, TASKS, find_task, get_task
 
 VARIANTS = [*(f"{name}-medium{variant}" for name in ROBOTS for variant in ("-v4", "-hidden")), "ant-medium-105d"]
 

@@ -9,7 +9,7 @@ import torch
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
-from envtf_lit.tasks import hopper_terminated
+from envtf_lit.robots.tasks import hopper_terminated
 from envtf_lit.world_models import termination
 from envtf_lit.world_models.termination import TerminationHead, learn_termination, load_termination, save_termination
 from tests.analytic import linear_data

@@ -11,21 +11,20 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from envtf_lit import pipeline
-from envtf_lit.config import params_yaml, preset_params
-from envtf_lit.data.formats import save_dataset
-from envtf_lit.params import (
-    ImaginationOptions,
-    ModelOptions,
-    Params,
-    PolicyOptions,
-    TrainModelOptions,
-    ValueGradientOptions,
-)
-from envtf_lit.storage import load_weights
+from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.data.sources.files import save_dataset
+from envtf_lit.files import load_weights
+from envtf_lit.imagination.options import ImaginationOptions, ValueGradientOptions
+from envtf_lit.pipeline.generate_rollouts import generate_rollouts
+from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.stage import WORLD_MODEL
+from envtf_lit.pipeline.train_model import train_model
+from envtf_lit.pipeline.train_policy import train_policy
+from envtf_lit.pipeline.yaml import params_yaml, preset_params
 from envtf_lit.training import fit, run_folder
-from envtf_lit.world_models.horizon import Scale, open_loop_error, segments
+from envtf_lit.world_models.forecast import Scale, open_loop_error, segments
 from envtf_lit.world_models.lit import SELECTION_HORIZON, SELECTION_SEGMENTS, lit_world_model, window_data
+from envtf_lit.world_models.options import ModelOptions, TrainModelOptions
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.walker import walker_dataset
@@ -108,7 +107,7 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 
 
 def train_both(root: Path, params: Params = TINY) -> dict[str, bytes]:
-    pipeline.train_model(params, root, progress=False)
+    train_model(params, root, progress=False)
     return bytes_of(root / "models/world_model")
 
 
@@ -135,7 +134,7 @@ def test_a_kill_followed_by_another_parameter_trains_afresh(root, monkeypatch):
 
 
 def test_the_kept_model_is_the_one_of_least_open_loop_error(root):
-    metrics = pipeline.train_model(TINY, root, progress=False)
+    metrics = train_model(TINY, root, progress=False)
     with (root / "models/world_model/curves.csv").open() as stream:
         errors = [float(row["val/open_loop_error"]) for row in csv.DictReader(stream)]
     assert len(errors) == 3 and metrics["open_loop_error"] == min(errors)
@@ -143,9 +142,9 @@ def test_the_kept_model_is_the_one_of_least_open_loop_error(root):
 
 @pytest.mark.parametrize("algorithm", ["cql", "et_cql"])
 def test_a_killed_policy_run_resumes_to_the_same_bits(root, monkeypatch, algorithm):
-    pipeline.train_model(TINY, root, progress=False)
-    pipeline.generate_rollouts(TINY, root, progress=False)
-    train = lambda: pipeline.train_policy(TINY, root, algorithm=algorithm, progress=False)  # noqa: E731
+    train_model(TINY, root, progress=False)
+    generate_rollouts(TINY, root, progress=False)
+    train = lambda: train_policy(TINY, root, algorithm=algorithm, progress=False)  # noqa: E731
     train()
     expected = bytes_of(root / "models/policy" / algorithm)
     with monkeypatch.context() as patch:
@@ -167,8 +166,8 @@ def test_compiled_training_learns_what_plain_training_learns(root, monkeypatch):
     options = replace(TINY.train_model, model=replace(TINY.train_model.model, dropout=0.0))
     for compile in (False, True):
         params = replace(TINY, precision="fp32", compile=compile, train_model=options)
-        pipeline.train_model(params, root, progress=False)
-        weights.append(load_world_model(root / pipeline.WORLD_MODEL).state_dict())
+        train_model(params, root, progress=False)
+        weights.append(load_world_model(root / WORLD_MODEL).state_dict())
     assert len(compiled) == 1
     torch.testing.assert_close(weights[1], weights[0])
 
@@ -194,7 +193,7 @@ def test_gradients_are_clipped_before_a_step_in_one_pass(root, precision):
 
 
 def test_gradient_steps_are_those_asked_for(root):
-    pipeline.train_policy(TINY, root, algorithm="cql", progress=False)
+    train_policy(TINY, root, algorithm="cql", progress=False)
     with (root / "models/policy/cql/curves.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert [row["epoch"] for row in rows] == ["1", "2", "3"]
@@ -213,7 +212,7 @@ def test_run_folders_differ_by_parameters_and_by_bytes(tmp_path):
 
 
 def test_the_training_metric_is_what_the_saved_model_scores(root):
-    metrics = pipeline.train_model(TINY, root, progress=False)
+    metrics = train_model(TINY, root, progress=False)
     training, held_out = walker_dataset().split(TINY.train_model.held_out, seed=TINY.seed)
     stretches = segments(held_out, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=TINY.seed)
     error = open_loop_error(load_world_model(root / "models/world_model"), stretches, Scale.of(training))

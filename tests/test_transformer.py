@@ -9,10 +9,11 @@ import torch
 from walker import walker_dataset
 
 from envtf_lit.errors import UserError
-from envtf_lit.params import ModelOptions
+from envtf_lit.world_models.attention import LARGE_CACHE, Attention, rotate, rotation
 from envtf_lit.world_models.interface import Prediction
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
-from envtf_lit.world_models.transformer import LARGE_CACHE, Attention, EnvironmentTransformer, rotate, rotation
+from envtf_lit.world_models.options import ModelOptions
+from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 S, A = 5, 2
 

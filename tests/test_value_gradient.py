@@ -10,11 +10,12 @@ from analytic import linear_data, linear_world
 from torch import Tensor, nn
 
 from envtf_lit.agents.cql import CQL
+from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.value_gradient import Paths, ValueGradient
 from envtf_lit.errors import UserError
-from envtf_lit.imagination import Imagination
-from envtf_lit.params import ImaginationOptions, PolicyOptions, ValueGradientOptions
-from envtf_lit.validation import build_params
+from envtf_lit.imagination.options import ImaginationOptions, ValueGradientOptions
+from envtf_lit.imagination.rollouts import Imagination
+from envtf_lit.pipeline.params import build_params
 
 OPTIONS = ValueGradientOptions(updates=4, rollouts=6, horizon=3, max_steps=9, trace=0.5, value_passes=2)
 ONE = torch.ones(())

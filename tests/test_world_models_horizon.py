@@ -6,17 +6,8 @@ import torch
 from analytic import linear_data, linear_world
 
 from envtf_lit.errors import UserError
-from envtf_lit.world_models.horizon import (
-    Scale,
-    error_quartiles,
-    forecast,
-    horizon_report,
-    nmse,
-    open_loop_error,
-    segments,
-    steps_within,
-    whole_episodes,
-)
+from envtf_lit.evaluation.horizon import error_quartiles, horizon_report, steps_within
+from envtf_lit.world_models.forecast import Scale, forecast, nmse, open_loop_error, segments, whole_episodes
 
 
 def test_a_perfect_model_is_censored_everywhere():

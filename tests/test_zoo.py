@@ -7,13 +7,14 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from envtf_lit import zoo as zoo_module
-from envtf_lit.cli import main
+from envtf_lit.cli.main import main
 from envtf_lit.data.cards import counted_episodes
-from envtf_lit.data.formats import load_dataset
+from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.tasks import TASKS
-from envtf_lit.zoo import Entry, build, catalogue
+from envtf_lit.figures.zoo import score_distributions
+from envtf_lit.robots.tasks import TASKS
+from envtf_lit.zoo import build as zoo_module
+from envtf_lit.zoo.build import Entry, build, catalogue
 
 NAMES = ["hopper-medium", "hopper-random", "ant-random-105d", "halfcheetah-random-v4", "hopper-random-hidden"]
 
@@ -26,7 +27,16 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def build_again(folder: Path, names: list[str], transitions: int = 300, seed: int = 0) -> list[Entry]:
-    return build(names, folder, transitions=transitions, seed=seed, workers=1, progress=False, report=lambda line: None)
+    return build(
+        names,
+        folder,
+        transitions=transitions,
+        seed=seed,
+        workers=1,
+        draw=score_distributions,
+        progress=False,
+        report=lambda line: None,
+    )
 
 
 def test_every_dataset_has_a_card_and_a_page(out: Path) -> None:
@@ -80,7 +90,7 @@ def test_what_is_there_is_left_alone_and_what_was_asked_otherwise_is_made_anew(o
 def test_each_dataset_is_reported_with_its_place_in_the_queue(out: Path) -> None:
     said: list[str] = []
     names = ["hopper-medium", "hopper-medium-v4"]
-    build(names, out, transitions=300, seed=0, workers=1, progress=False, report=said.append)
+    build(names, out, transitions=300, seed=0, workers=1, draw=score_distributions, progress=False, report=said.append)
     assert said[0] == "1 of 2, hopper-medium: is there"
     assert said[1].startswith("2 of 2, hopper-medium-v4: mean score ")
     for path in out.glob("hopper-medium-v4.*"):

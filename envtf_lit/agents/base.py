@@ -13,12 +13,13 @@ from torch import Tensor, nn
 
 from envtf_lit import training
 from envtf_lit.agents.networks import StackedCritics
+from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.ring import ImaginedRing
 from envtf_lit.agents.value_gradient import ValueGradient
 from envtf_lit.data.loaders import TransitionData, epoch_generator
 from envtf_lit.errors import UserError
-from envtf_lit.imagination import Imagination, Rollouts
-from envtf_lit.params import ImaginationOptions, PolicyOptions, ValueGradientOptions
+from envtf_lit.imagination.options import ImaginationOptions, ValueGradientOptions
+from envtf_lit.imagination.rollouts import Imagination, Rollouts
 from envtf_lit.policy import TanhGaussianActor, load_policy
 
 Batch = dict[str, Tensor]

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from envtf_lit.data.loaders import TransitionData
-from envtf_lit.params import GenerateRolloutsOptions, Precision
+from envtf_lit.imagination.options import GenerateRolloutsOptions
+from envtf_lit.options.schema import Precision
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.training import Curves, fit
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit.agents.networks import StateValue
-from envtf_lit.imagination import Imagination
-from envtf_lit.params import ValueGradientOptions
+from envtf_lit.imagination.options import ValueGradientOptions
+from envtf_lit.imagination.rollouts import Imagination
 from envtf_lit.policy import TanhGaussianActor
 
 VALUE_BATCH = 256  # states per gradient step of the state value

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.tasks import get_task
+from envtf_lit.robots.tasks import Robot, get_task
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 UNLIMITED = ("file", "minari")  # sources that say nothing of the time limit under which they were recorded
@@ -142,3 +142,9 @@ def _arguments(env_kwargs: dict[str, Any]) -> str:
 
 def _number(value: float | None, digits: int = 0) -> str:
     return "" if value is None else f"{value:,.{digits}f}"
+
+
+def dataset_scores(dataset: OfflineDataset, robot: Robot, source: str) -> np.ndarray:
+    """(E,) D4RL-normalised score of each recorded episode that counts (see `counted_episodes`)."""
+    counted = dataset.episode_returns[counted_episodes(dataset, source)]
+    return np.array([robot.normalised_score(value) for value in counted])

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from envtf_lit.data.checks import Finding, examine
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.formats import is_hdf5, save_dataset
-from envtf_lit.data.minari_sets import MINARI, open_source, write_minari
-from envtf_lit.data.validation import Finding, examine
+from envtf_lit.data.sources.files import is_hdf5, save_dataset
+from envtf_lit.data.sources.minari import MINARI, open_source, write_minari
 from envtf_lit.errors import UserError
 
 

@@ -10,12 +10,12 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from envtf_lit.data.checks import Finding, examine
 from envtf_lit.data.columns import blocks, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.minari_sets import open_source
-from envtf_lit.data.validation import Finding, examine
+from envtf_lit.data.sources.minari import open_source
 from envtf_lit.errors import UserError
-from envtf_lit.tasks import get_task
+from envtf_lit.robots.tasks import get_task
 
 STYLES = {"error": "bold red", "warning": "yellow", "note": "cyan"}  # the gravest first
 BARS = 10  # of the histogram of returns

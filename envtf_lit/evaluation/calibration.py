@@ -15,14 +15,16 @@ from torch import Tensor
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
+from envtf_lit.evaluation.horizon import LARGEST
 from envtf_lit.evaluation.physics import Physics
-from envtf_lit.imagination import BranchPoints, imagine
+from envtf_lit.imagination.histories import BranchPoints
+from envtf_lit.imagination.rollouts import imagine
 from envtf_lit.policy import Policy
-from envtf_lit.world_models.horizon import LARGEST, Forecast, Scale, Trajectories
+from envtf_lit.world_models.forecast import Forecast, Scale, Trajectories
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.normaliser import CONSTANT
-from envtf_lit.world_models.recalibration import fitted, normal_scores
-from envtf_lit.world_models.tails import crps, half_width, log_density
+from envtf_lit.world_models.uncertainty.recalibration import fitted, normal_scores
+from envtf_lit.world_models.uncertainty.tails import crps, half_width, log_density
 
 FIRST_STEPS = 10  # of an episode: just after a reset robots are where they hardly ever are again
 

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.evaluation.horizon import HorizonReport
 from envtf_lit.policy import Policy
-from envtf_lit.world_models.horizon import HorizonReport, Trajectories
+from envtf_lit.world_models.forecast import Trajectories
 from envtf_lit.world_models.interface import WorldModel
 
 LIVE = 1e-6  # an action dimension that varies less has no choice to agree about

@@ -22,8 +22,9 @@ import torch
 from torch import Tensor
 
 from envtf_lit.errors import UserError
-from envtf_lit.tasks import ROBOTS, Robot, quiet_mujoco
-from envtf_lit.world_models.horizon import EXPLODED, THRESHOLDS, Scale, Steps, Trajectories, nmse
+from envtf_lit.evaluation.horizon import EXPLODED, THRESHOLDS, Steps
+from envtf_lit.robots.tasks import ROBOTS, Robot, quiet_mujoco
+from envtf_lit.world_models.forecast import Scale, Trajectories, nmse
 
 # after these MuJoCo goes on from its initial state
 GIVEN_UP = [int(getattr(mujoco.mjtWarning, f"mjWARN_BADQ{kind}")) for kind in ("POS", "VEL", "ACC")]  # pyright: ignore

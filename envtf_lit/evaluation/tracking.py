@@ -12,23 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envtf_lit.data.behaviour import collect
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.evaluation.horizon import EXPLODED, LARGEST, THRESHOLDS, Steps, error_quartiles, horizon_report
 from envtf_lit.evaluation.physics import Ceiling
-from envtf_lit.tasks import Task, never_terminated
-from envtf_lit.world_models.horizon import (
-    EXPLODED,
-    LARGEST,
-    THRESHOLDS,
-    Scale,
-    Steps,
-    Trajectories,
-    error_quartiles,
-    forecast,
-    horizon_report,
-    nmse,
-)
+from envtf_lit.robots.tasks import Task, never_terminated
+from envtf_lit.world_models.forecast import Scale, Trajectories, forecast, nmse
 from envtf_lit.world_models.interface import WorldModel
+from envtf_lit.zoo.collect import collect
 
 PROBE = 10_000  # rows that tell how long episodes are
 CURVE = np.unique(np.geomspace(1, 1000, 150).round().astype(int))  # the steps that curves are kept at

@@ -28,7 +28,7 @@ def calibration_page(curves: Mapping[str, Mapping[str, Mapping[str, Columns]]], 
     """Coverage, three ROC curves, and true error against predicted uncertainty (median, quartiles).
 
     Args:
-        curves: by robot, model and panel, as `envtf_lit.calibration` measures them; a model may lack some panels.
+        curves: by robot, model and panel, as `envtf_lit.studies.calibration` measures them; a model may lack some.
         path: PNG to write; the numbers go beside it as CSV.
     """
     looks = model_looks(dict.fromkeys(model for models in curves.values() for model in models))

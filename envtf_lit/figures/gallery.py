@@ -8,13 +8,14 @@ import pandas as pd
 
 from envtf_lit.data.cards import counted_episodes
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.evaluation.evidence import comparable
+from envtf_lit.evaluation.horizon import HorizonReport
+from envtf_lit.evaluation.metrics import comparable
 from envtf_lit.evaluation.offline import Promises
-from envtf_lit.evaluation.returns import Returns
 from envtf_lit.figures import learning, model, scores
 from envtf_lit.figures.style import write_table
-from envtf_lit.tasks import Robot
-from envtf_lit.world_models.horizon import HorizonReport, Scale
+from envtf_lit.robots.returns import Returns
+from envtf_lit.robots.tasks import Robot
+from envtf_lit.world_models.forecast import Scale
 
 
 def draw_dataset(dataset: OfflineDataset, source: str, folder: Path) -> None:

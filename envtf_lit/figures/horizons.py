@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from envtf_lit.evaluation.horizon import THRESHOLDS
 from envtf_lit.figures.style import COLOURS, Look, drawing, model_looks, write_table
-from envtf_lit.world_models.horizon import THRESHOLDS
 
 LOWEST, HIGHEST = 1e-6, 1e2  # errors that are drawn
 CEILING = "ceiling_typical"  # what median curves are to be compared with

@@ -12,7 +12,7 @@ from nbconvert import HTMLExporter
 from papermill.exceptions import PapermillExecutionError
 
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.storage import replacing
+from envtf_lit.files import replacing
 
 FOLDED = """
 {%- extends 'lab/index.html.j2' -%}

@@ -13,8 +13,8 @@ import seaborn as sns
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from envtf_lit.storage import replacing
-from envtf_lit.tasks import ROBOTS
+from envtf_lit.files import replacing
+from envtf_lit.robots.tasks import ROBOTS
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart
 COLOURS = {

@@ -13,11 +13,11 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from envtf_lit.errors import UserError
-from envtf_lit.evaluation.returns import Episode
 from envtf_lit.figures.style import COLOURS
-from envtf_lit.storage import replacing
-from envtf_lit.tasks import ROBOTS, Robot
-from envtf_lit.world_models.horizon import Scale, Trajectories, forecast, nmse
+from envtf_lit.files import replacing
+from envtf_lit.robots.returns import Episode
+from envtf_lit.robots.tasks import ROBOTS, Robot
+from envtf_lit.world_models.forecast import Scale, Trajectories, forecast, nmse
 from envtf_lit.world_models.interface import WorldModel
 
 BACKENDS = ("egl", "osmesa", "disabled")  # of MUJOCO_GL, best first; without any GL the links are drawn as lines

@@ -8,7 +8,7 @@ import pandas as pd
 
 from envtf_lit.data.cards import distribution
 from envtf_lit.figures.style import drawing, write_table
-from envtf_lit.tasks import TIERS, get_task
+from envtf_lit.robots.tasks import TIERS, get_task
 
 BINS = 60
 TIER_COLOURS: dict[str, str] = dict(zip(TIERS, ("#8c8c8c", "#0072B2", "#56B4E9", "#D55E00", "#009E73"), strict=True))

@@ -16,9 +16,9 @@ from torch.nn import functional as F
 
 from envtf_lit.errors import UserError
 from envtf_lit.world_models.interface import Mode, Prediction
-from envtf_lit.world_models.laplace import OUTSIDE, quantile
 from envtf_lit.world_models.normaliser import Normaliser
 from envtf_lit.world_models.objectives import nll
+from envtf_lit.world_models.uncertainty.laplace import OUTSIDE, quantile
 
 LOG_VARIANCE_BOUNDS = -10.0, 0.5  # where the learned bounds start
 BOUND_WEIGHT = 0.01  # of the term that draws the bounds together

@@ -13,12 +13,12 @@ from torch import Tensor
 from envtf_lit import training
 from envtf_lit.data.loaders import WindowData, epoch_generator
 from envtf_lit.errors import UserError
-from envtf_lit.params import EnsembleOptions, ModelOptions, TrainModelOptions
 from envtf_lit.world_models.ensemble import EnsembleDynamics
-from envtf_lit.world_models.horizon import Scale, open_loop_error, segments, whole_episodes
-from envtf_lit.world_models.recalibration import calibration_split
+from envtf_lit.world_models.forecast import Scale, open_loop_error, segments, whole_episodes
+from envtf_lit.world_models.options import EnsembleOptions, ModelOptions, TrainModelOptions
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
+from envtf_lit.world_models.uncertainty.recalibration import calibration_split
 
 SELECTION_SEGMENTS, SELECTION_HORIZON = 256, 20  # open-loop stretches by which models are selected
 EPISTEMIC_TOKENS = 100_000  # training rows that epistemic variance is fitted to, at most

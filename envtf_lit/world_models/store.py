@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import nn
 
-from envtf_lit.storage import load_module, save_module
+from envtf_lit.files import load_module, save_module
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 

@@ -1,10 +1,11 @@
 """Where a robot whose rule nobody wrote down terminates: learned from the log, by the next state alone.
 
-The robots of the twenty tasks have their rules in `envtf_lit.tasks`; this is for data of one's own.
+The robots of the twenty tasks have their rules in `envtf_lit.robots.tasks`; this is for data of one's own.
 """
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -14,7 +15,8 @@ from torch.nn import functional as F
 from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import epoch_generator
-from envtf_lit.storage import load_module, save_module
+from envtf_lit.files import load_module, save_module
+from envtf_lit.robots.tasks import get_task, never_terminated
 from envtf_lit.world_models.normaliser import CONSTANT
 
 HIDDEN, UPDATES, BATCH, LEARNING_RATE = 64, 2_000, 256, 0.003
@@ -118,3 +120,37 @@ def load_termination(folder: str | Path) -> Any:
         UserError: the folder is missing, damaged, or holds something else.
     """
     return load_module(folder, {"termination_head": TerminationHead}).requires_grad_(False)
+
+
+TERMINATION = "termination"  # below the world model, where it had to be learned
+
+
+def termination_source(task: str | None, model: Path) -> Literal["rule", "learned", "none"]:
+    """Where imagined rollouts end.
+
+    Args:
+        task: robot and tier, whose rule is known; None for a robot of one's own.
+        model: folder of the world model, which may hold a learned head.
+
+    Returns:
+        `rule` of the robot, `learned` head, or `none`: at their horizon alone.
+    """
+    if task is not None:
+        return "rule"
+    return "learned" if (model / TERMINATION).exists() else "none"
+
+
+def termination_rule(task: str | None, model: Path, device: torch.device) -> Callable[[Tensor], Tensor]:
+    """What decides whether imagined robots have fallen: next observations (..., S) to bool (...).
+
+    Args:
+        task, model: as of `termination_source`.
+        device: of the observations.
+    """
+    match termination_source(task, model):
+        case "rule":
+            return get_task(str(task)).robot.terminated
+        case "learned":
+            return load_termination(model / TERMINATION).to(device).terminated
+        case "none":
+            return never_terminated

@@ -1,0 +1,32 @@
+"""Policies on disk, with what is known of their training."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from envtf_lit.files import replacing
+from envtf_lit.policy import save_policy
+from envtf_lit.training import record_training
+
+
+def publish_policy(
+    target: Path, actor: Any, curves: Any, kept: Mapping[str, float], settings: dict[str, Any]
+) -> dict[str, Any]:
+    """Writes a policy's folder.
+
+    Args:
+        target: folder of the weights, metrics, curves and resolved options.
+        actor: the `TanhGaussianActor` to keep.
+        curves: the `Curves` of the training.
+        kept: the row of them that belongs to the actor.
+        settings: the resolved options.
+
+    Returns:
+        The row, its columns named without their split.
+    """
+
+    metrics = {name.rpartition("/")[2]: value for name, value in kept.items()}
+    with replacing(target) as folder:
+        save_policy(folder, actor)
+        record_training(folder, metrics, settings, curves)
+    return metrics

@@ -1,0 +1,316 @@
+"""D4RL-style HDF5 and NPZ files, in both directions. docs/datasets.md names the columns.
+
+Nothing in a file can run code or lead elsewhere: no objects, no pickle, no links, no storage outside the file, no
+filters but HDF5's own, no sizes that the file itself cannot hold.
+"""
+
+import math
+import struct
+import warnings
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import h5py
+import numpy as np
+
+from envtf_lit.data.checks import Finding, build_dataset
+from envtf_lit.data.columns import Column, FileRows, column_blocks
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.errors import UserError
+from envtf_lit.files import replacing
+
+# the first name is the one that we write
+ALIASES = {
+    "observations": ("observations",),
+    "actions": ("actions",),
+    "rewards": ("rewards",),
+    "next_observations": ("next_observations",),
+    "terminated": ("terminals", "terminated"),
+    "truncated": ("timeouts", "truncated"),
+    "episode_index": ("episode_index", "episode", "episode_id", "episode_ids"),
+}
+ATTRIBUTES = ("task", "action_low", "action_high")
+HDF5_ENDINGS, NPZ_ENDINGS = (".h5", ".hdf5"), (".npz",)
+HDF5_FILTERS = {1, 2, 3, 4, 5, 6, 32000}  # gzip, shuffle, fletcher32, szip, nbit, scaleoffset, lzf: no plugins
+# no log of numbers shrinks to a 200th: a file that declares more than this, and more than that, is damaged or a trap
+BOMB_RATIO, BOMB_BYTES = 200, 256 << 20
+LARGEST_ATTRIBUTE = 1 << 20  # bytes
+# of a file with more than this, columns of more than a quarter of it stay there and are read as they are needed
+RESIDENT_BYTES = 256 << 20
+
+
+@dataclass
+class Raw:
+    """What a file holds, as it lies there.
+
+    Attributes:
+        columns: by our names; arrays, or what has `shape`, `dtype` and slices like one while the file is open.
+        attributes: `task`, `action_low`, `action_high`, where there are such.
+        ignored: names of everything else.
+        broken: columns that are there and cannot be read, by our names, and why.
+    """
+
+    columns: dict[str, Any] = field(default_factory=dict)
+    attributes: dict[str, Any] = field(default_factory=dict)
+    ignored: list[str] = field(default_factory=list)
+    broken: dict[str, Finding] = field(default_factory=dict)
+
+
+def save_dataset(dataset: OfflineDataset, path: str | Path) -> None:
+    """Writes a dataset by the file's ending (.h5, .hdf5, .npz); equal datasets give equal bytes.
+
+    Raises:
+        UserError: another ending, a full disk, or a place that cannot be written. Nothing half-written stays.
+    """
+    path = Path(path)
+    write = _write_hdf5 if is_hdf5(path) else _write_npz
+    arrays = {ALIASES[column][0]: getattr(dataset, column) for column in ALIASES if column != "episode_index"}
+    attributes = {name: getattr(dataset, name) for name in ATTRIBUTES if getattr(dataset, name) is not None}
+    with replacing(path) as temporary:
+        write(temporary, arrays, attributes)
+
+
+def load_dataset(path: str | Path, *, task: str | None = None) -> OfflineDataset:
+    """Reads and checks a dataset.
+
+    Integer and float64 columns become float32, 0/1 columns bool. Where `next_observations` is missing, a row's
+    successor is the next row of its episode, and the last row of each episode, having none, is dropped; the log then
+    no longer shows how episodes ended, so prefer files that have it. A last row without an ending is marked truncated.
+    Without `action_low` and `action_high` the limits are the task's, else [-1, 1].
+
+    Args:
+        path: an HDF5 (.h5, .hdf5) or NPZ file.
+        task: such as `hopper-medium-replay`; None takes the name in the file, where there is one.
+
+    Raises:
+        UserError: the file is missing, damaged, incomplete, inconsistent, or does not fit the task.
+    """
+    with open_raw(path) as raw:
+        return build_dataset(raw.columns, raw.attributes, task=task, source=str(path), broken=raw.broken)
+
+
+@contextmanager
+def open_raw(path: str | Path) -> Iterator[Raw]:
+    """Opens a file for reading its columns; they may be used inside the block alone.
+
+    Raises:
+        UserError: the file is missing, may not be read, is none of its kind, or is made to do harm.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path} is not a file: check the path, or run the stage that writes it.")
+    opening, kind = (_open_hdf5, "an HDF5") if is_hdf5(path) else (_open_npz, "an NPZ")
+    file = None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what is odd in a file, the findings speak
+            file, raw = opening(path)
+    except UserError:
+        raise
+    except PermissionError:
+        raise UserError(f"{path} may not be read: change its permissions.") from None
+    except Exception as error:  # whatever a decoder of foreign bytes raises
+        reason = " ".join(str(error).split())[:300]
+        raise UserError(f"{path} is damaged or not {kind} file ({reason}): fetch or write it anew.") from None
+    try:
+        yield raw
+    finally:
+        file.close()
+
+
+def is_hdf5(path: Path) -> bool:
+    """Whether the ending says HDF5 rather than NPZ.
+
+    Raises:
+        UserError: it says neither.
+    """
+    ending = path.suffix.lower()
+    if ending not in HDF5_ENDINGS + NPZ_ENDINGS:
+        raise UserError(f"{path} ends in {ending!r}: name a dataset .h5, .hdf5 or .npz.")
+    return ending in HDF5_ENDINGS
+
+
+def _write_hdf5(path: Path, arrays: dict[str, Column], attributes: dict[str, Any]) -> None:
+    # through Python's own file: a full disk is then an OSError with its number, and early
+    with path.open("w+b") as stream, h5py.File(stream, "w") as file:
+        for name, array in arrays.items():
+            column = file.create_dataset(name, array.shape, array.dtype, track_times=False)
+            for block in column_blocks(array):
+                column[block] = array[block]
+        file.attrs.update(attributes)
+
+
+def _write_npz(path: Path, arrays: dict[str, Column], attributes: dict[str, Any]) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in (arrays | {name: np.asarray(value) for name, value in attributes.items()}).items():
+            member = zipfile.ZipInfo(f"{name}.npy")  # of 1980, whatever the clock says
+            with archive.open(member, "w", force_zip64=True) as stream:
+                layout = {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False}
+                np.lib.format.write_array_header_1_0(stream, layout | {"shape": array.shape})
+                for block in column_blocks(array) if array.shape else [...]:
+                    stream.write(np.ascontiguousarray(array[block]).tobytes())
+
+
+def _find_names(present: Iterable[str]) -> tuple[dict[str, str], list[str]]:
+    """Our column to the name it has in a file, for those that are there; and the names of nothing of ours."""
+    there = list(present)
+    found = {
+        column: name for column, names in ALIASES.items() if (name := next((n for n in names if n in there), None))
+    }
+    return found, [name for name in there if name not in found.values() and name not in ATTRIBUTES]
+
+
+def check_size(path: Path, declared: dict[str, int]) -> None:
+    """Refuses sizes (bytes of each array) that make a small file a large one.
+
+    Raises:
+        UserError: the file declares hundreds of times what it holds.
+    """
+    total, stored = sum(declared.values()), path.stat().st_size
+    if total > BOMB_BYTES and total > BOMB_RATIO * stored:
+        name = max(declared, key=lambda key: declared[key])
+        raise UserError(
+            f"{path} has {stored:,} bytes and declares {declared[name]:,} of {name!r}: it is damaged or a trap that "
+            "fills the memory; fetch or write it anew."
+        )
+
+
+# HDF5
+
+
+def _open_hdf5(path: Path) -> tuple[h5py.File, Raw]:
+    file = h5py.File(path, "r")
+    try:
+        raw = Raw()
+        names, raw.ignored = _find_names(file)  # iterates over names alone, following no link
+        for column, name in names.items():
+            item = _plain_hdf5(file, name)
+            if item is None:
+                what = f"there is no plain numeric array under {name!r}"
+                raw.broken[column] = Finding("error", what, "store one, without links, objects or foreign filters")
+            else:
+                raw.columns[column] = item
+        check_size(path, {name: hdf5_bytes(item) for name, item in raw.columns.items()})
+        if path.stat().st_size > RESIDENT_BYTES:
+            raw.columns |= {name: rows for name, item in raw.columns.items() if (rows := _hdf5_rows(path, item))}
+        for name in ATTRIBUTES:
+            if name in file.attrs:
+                raw.attributes[name] = _hdf5_attribute(file, name)
+    except BaseException:
+        file.close()
+        raise
+    return file, raw
+
+
+def own_hdf5(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
+    """What lies in this very file under that name; None for what leads to another, or to the code of plugins."""
+    item = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
+    if isinstance(item, h5py.Group):
+        return item
+    if not isinstance(item, h5py.Dataset):
+        return None
+    plan = item.id.get_create_plist()
+    filters = {plan.get_filter(index)[0] for index in range(plan.get_nfilters())}
+    return None if item.external or item.is_virtual or filters - HDF5_FILTERS else item
+
+
+def hdf5_bytes(item: h5py.Dataset) -> int:
+    """What reading takes: all of it, and at least one chunk."""
+    return item.dtype.itemsize * max(math.prod(item.shape or ()), math.prod(item.chunks or ()))
+
+
+def _plain_hdf5(file: h5py.File, name: str) -> h5py.Dataset | None:
+    """A plain array of numbers."""
+    item = own_hdf5(file, name)
+    return item if isinstance(item, h5py.Dataset) and item.shape is not None and item.dtype.kind in "biuf" else None
+
+
+def _hdf5_rows(path: Path, item: h5py.Dataset) -> FileRows | None:
+    """The same array outside of HDF5, if it lies in one piece in the form that we keep it in."""
+    offset = item.id.get_offset()
+    plain = item.chunks is None and item.dtype == np.dtype("<f4") and item.file.userblock_size == 0
+    wide = item.ndim == 2 and hdf5_bytes(item) > RESIDENT_BYTES // 4
+    if not (plain and wide) or offset is None or offset + hdf5_bytes(item) > path.stat().st_size:
+        return None
+    return FileRows(path, offset, item.shape)
+
+
+def _hdf5_attribute(file: h5py.File, name: str) -> Any:
+    attribute = file.attrs.get_id(name)
+    plain = attribute.dtype.kind in "biufSU" or h5py.check_string_dtype(attribute.dtype) is not None
+    if not plain or math.prod(attribute.shape) * attribute.dtype.itemsize > LARGEST_ATTRIBUTE:
+        return np.array("neither a short text nor a few numbers")
+    return file.attrs[name]
+
+
+# NPZ: a zip archive of arrays
+
+
+def _open_npz(path: Path) -> tuple[zipfile.ZipFile, Raw]:
+    archive = zipfile.ZipFile(path)
+    try:
+        raw = Raw()
+        for member in archive.namelist():
+            if PurePosixPath(member).is_absolute() or ".." in member.replace("\\", "/").split("/"):
+                raise UserError(f"{path} has a member {member[:80]!r} that leaves its folder: do not trust this file.")
+        members = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
+        names, raw.ignored = _find_names(members)
+        declared = {name: archive.getinfo(members[name]).file_size for name in names.values()}
+        check_size(path, declared)
+        for column, name in names.items():
+            _read_member(raw, path, archive, members[name], column)
+        for name in ATTRIBUTES:
+            if name in members and archive.getinfo(members[name]).file_size <= LARGEST_ATTRIBUTE:
+                with archive.open(members[name]) as stream:
+                    raw.attributes[name] = np.lib.format.read_array(stream, allow_pickle=False)
+    except BaseException:
+        archive.close()
+        raise
+    return archive, raw
+
+
+def _read_member(raw: Raw, path: Path, archive: zipfile.ZipFile, member: str, column: str) -> None:
+    try:
+        with archive.open(member) as stream:
+            shape, columns_first, dtype = _read_header(stream)
+            begin = stream.tell()
+            if dtype.kind not in "biuf":
+                raw.broken[column] = Finding("error", f"{column!r} holds {dtype} values", "store plain numbers")
+                return
+            if math.prod(shape) * dtype.itemsize > archive.getinfo(member).file_size - begin:
+                raise ValueError(f"it declares shape {shape} and holds less")
+            plain = dtype == np.dtype("<f4") and len(shape) == 2 and not columns_first and 0 not in shape
+            large = path.stat().st_size > RESIDENT_BYTES and archive.getinfo(member).file_size > RESIDENT_BYTES // 4
+            if plain and large and (start := _stored_at(path, archive, member)):
+                raw.columns[column] = FileRows(path, start + begin, (shape[0], shape[1]))
+                return
+        with archive.open(member) as stream:
+            raw.columns[column] = np.lib.format.read_array(stream, allow_pickle=False)
+    except Exception as error:  # whatever a decoder of foreign bytes raises
+        reason = " ".join(str(error).split())[:200]
+        raw.broken[column] = Finding("error", f"{column!r} is damaged ({reason})", "fetch or write the file anew")
+
+
+def _stored_at(path: Path, archive: zipfile.ZipFile, member: str) -> int | None:
+    """Where in the file a member begins, None if it is compressed."""
+    info = archive.getinfo(member)
+    if info.compress_type != zipfile.ZIP_STORED:
+        return None
+    with path.open("rb") as file:
+        file.seek(info.header_offset + 26)
+        name, extra = struct.unpack("<HH", file.read(4))  # their lengths
+    start = info.header_offset + 30 + name + extra
+    return start if start + info.file_size <= path.stat().st_size else None
+
+
+def _read_header(stream: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        return np.lib.format.read_array_header_1_0(stream)
+    if version == (2, 0):
+        return np.lib.format.read_array_header_2_0(stream)
+    raise ValueError(f"version {version} of the format is for records, not numbers")

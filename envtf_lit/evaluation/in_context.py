@@ -1,0 +1,72 @@
+"""Does a model find out which robot it is in? Its errors by how much of an episode it has seen."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.world_models.forecast import Scale, Trajectories, forecast, nmse, segments
+from envtf_lit.world_models.interface import WorldModel
+
+CONTEXT = 32  # positions whose one-step error is measured: 0 to 31 steps of history
+HISTORY, HORIZON = 16, 25  # the open loop's: steps seen before it, and its length
+QUANTILES = (0.25, 0.5, 0.75)
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """Lower quartile, median and upper quartile of a model's errors (nmse, see `world_models.horizon`) over stretches.
+
+    Attributes:
+        one_step: 3 curves of 32: one step ahead, the c-th after c steps of true history.
+        open_loop: 3 curves of 25: after 1 to 25 steps of the model's own, begun after 16 steps of true history.
+    """
+
+    one_step: list[list[float]]
+    open_loop: list[list[float]]
+
+    @classmethod
+    def of(cls, one_step: Tensor, open_loop: Tensor) -> "Recognition":
+        """From the errors (N, 32) and (N, 25) of N stretches."""
+        return cls(*(np.quantile(error.cpu().numpy(), QUANTILES, axis=0).tolist() for error in (one_step, open_loop)))
+
+
+def stretches(dataset: OfflineDataset, count: int, *, seed: int) -> Trajectories:
+    """What models are measured on: stretches of whole length from rows drawn at random.
+
+    They start anywhere in an episode, so that a position in the stretch says how much a model has seen, and nothing of
+    how long ago the robot was reset.
+
+    Raises:
+        UserError: no episode is long enough.
+    """
+    return segments(dataset, count, max(CONTEXT, HISTORY + HORIZON), seed=seed, whole=True)
+
+
+def recognition(model: WorldModel, trajectories: Trajectories, scale: Scale) -> Recognition:
+    """Measures a model on what `stretches` gives, on the same device."""
+    taught = forecast(model, trajectories, feedback="recorded")
+    free = forecast(model, trajectories, feedback="imagined", history=HISTORY)
+    one_step, open_loop = (nmse(run.mean, trajectories, scale) for run in (taught, free))
+    return Recognition.of(one_step[:, :CONTEXT], open_loop[:, HISTORY : HISTORY + HORIZON])
+
+
+def recognition_metrics(found: dict[str, Recognition]) -> dict[str, Any]:
+    """Medians over the stretches, by `model.metric`, and the transformer's as a share of every other model's.
+
+    `one_step` is after 16 steps of history, `open_loop` at the 25th step of a model's own after them; `…_by_context`
+    and `…_by_step` are the whole curves.
+    """
+    metrics: dict[str, Any] = {}
+    for name, errors in found.items():
+        one_step, open_loop = errors.one_step[1], errors.open_loop[1]
+        metrics[f"{name}.one_step"] = one_step[HISTORY]
+        metrics[f"{name}.open_loop"] = open_loop[-1]
+        metrics[f"{name}.one_step_by_context"] = one_step
+        metrics[f"{name}.open_loop_by_step"] = open_loop
+    for name in found.keys() - {"transformer"}:
+        for kind in ("one_step", "open_loop"):
+            metrics[f"transformer.{kind}_vs_{name}"] = metrics[f"transformer.{kind}"] / metrics[f"{name}.{kind}"]
+    return metrics

@@ -1,0 +1,28 @@
+"""The stage `download`: makes, fetches or reads the dataset."""
+
+from pathlib import Path
+from typing import Any
+
+from envtf_lit.data.cards import dataset_card
+from envtf_lit.data.sources.files import save_dataset
+from envtf_lit.files import write_json
+from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.sources import make_dataset
+from envtf_lit.pipeline.stage import CARD, DATASET, run_stage
+from envtf_lit.robots.tasks import get_task
+
+
+def download(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
+    """Makes or reads the dataset: `data/dataset.h5` and its card, which is returned."""
+    with run_stage("download", params, root):
+        dataset, origin = make_dataset(
+            None if params.task is None else get_task(params.task),
+            params.download,
+            seed=params.seed,
+            workers=params.threads,
+            progress=progress,
+        )
+        save_dataset(dataset, root / DATASET)
+        card = dataset_card(dataset, params.download.source, origin)
+        write_json(root / CARD, card)
+    return card

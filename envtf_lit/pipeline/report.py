@@ -1,0 +1,21 @@
+"""The stage `report`: executes the report notebook."""
+
+from pathlib import Path
+from typing import Any
+
+from envtf_lit.figures.notebook import execute
+from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.stage import REPORTS, run_stage
+
+
+def report(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
+    """Executes `notebooks/report.ipynb` on the other stages' outputs: `reports/report.ipynb` and `.html`."""
+    with run_stage("report", params, root):
+        page = execute(
+            root / "notebooks/report.ipynb",
+            root / REPORTS / "report.ipynb",
+            {"root": "."},
+            cwd=root,
+            progress=progress,
+        )
+    return {"report": str(page)}

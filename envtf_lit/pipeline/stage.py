@@ -1,0 +1,57 @@
+"""What the stages share: where their files lie, seeds and threads, timings."""
+
+import contextlib
+import resource
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+
+from envtf_lit.files import read_json, write_json
+from envtf_lit.pipeline.params import Params
+from envtf_lit.robots.tasks import Robot, get_task
+
+DATASET, CARD = Path("data/dataset.h5"), Path("data/dataset.json")
+WORLD_MODEL, BEHAVIOUR = Path("models/world_model"), Path("models/behaviour")
+ROLLOUTS, POLICIES = Path("data/rollouts.h5"), Path("models/policy")
+REPORTS, METRICS = Path("reports"), Path("reports/metrics.json")
+PLOTS, VIDEO = Path("reports/plots"), Path("reports/video")
+ALGORITHMS = ("cql", "et_cql")
+
+
+def robot_of(params: Params) -> Robot | None:
+    """The task's robot, or None where the data are of a robot of one's own."""
+    return None if params.task is None else get_task(params.task).robot
+
+
+def unseen(params: Params) -> dict[str, float]:
+    """What policies must not see: where no simulator can score them, held-out actions have to."""
+    return {"held_out": params.train_model.held_out} if params.task is None else {}
+
+
+def run_settings(params: Params, options: dict[str, Any]) -> dict[str, Any]:
+    """What a run's result depends on, beside its input files."""
+    common = {name: getattr(params, name) for name in ("seed", "threads", "precision", "compile")}
+    return common | {"options": options}
+
+
+@contextlib.contextmanager
+def run_stage(name: str, params: Params, root: Path) -> Iterator[None]:
+    """Threads and seeds for a stage; its wall time and peak memory go to a side file that no hash covers."""
+    torch.set_num_threads(params.threads)
+    L.seed_everything(params.seed, verbose=False)
+    begin = time.perf_counter()
+    yield
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    note_timing(root, name, {"seconds": round(time.perf_counter() - begin, 1), "peak_memory_mb": round(peak)})
+
+
+def note_timing(root: Path, name: str, value: Any) -> None:
+    """Notes seconds or rates in `.envtf/timings.json`, a side file that no hash covers."""
+    path = root / ".envtf" / "timings.json"
+    with contextlib.suppress(ValueError):  # a damaged side file is begun anew
+        timings = read_json(path) if path.exists() else {}
+        write_json(path, timings | {name: value})

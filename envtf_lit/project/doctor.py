@@ -1,0 +1,71 @@
+"""What a bug report needs to know of a machine."""
+
+import os
+import platform
+import shutil
+import sys
+from importlib.metadata import PackageNotFoundError, version
+
+PACKAGES = (
+    "envtf-lit",
+    "torch",
+    "lightning",
+    "gymnasium",
+    "mujoco",
+    "numpy",
+    "h5py",
+    "dvc",
+    "papermill",
+    "jsonargparse",
+)
+
+
+def report() -> dict[str, str]:
+    """Versions, threads, memory, disk, accelerator and the working GL back end, each as a short text."""
+    return {
+        "platform": f"{platform.platform()}, {platform.machine()}",
+        "python": f"{platform.python_version()} in {sys.prefix}",
+        **{package: _version(package) for package in PACKAGES},
+        **_torch(),
+        "memory": f"{_memory_gib():.1f} GiB",
+        "disk here": "{2:.1f} of {0:.1f} GiB free".format(*(x / 2**30 for x in shutil.disk_usage("."))),
+        "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
+        "rendering": _rendering(),
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "missing"
+
+
+def _torch() -> dict[str, str]:
+    import torch
+
+    from envtf_lit.files import pick_device
+
+    device = pick_device()
+    name = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
+    return {
+        "cores": f"{_usable_cores()} usable of {os.cpu_count()}",
+        "torch threads": f"{torch.get_num_threads()} (OMP_NUM_THREADS {os.environ.get('OMP_NUM_THREADS', 'not set')})",
+        "device": f"{device} {name}".strip(),
+    }
+
+
+def _usable_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _memory_gib() -> float:
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+
+
+def _rendering() -> str:
+    os.environ.pop("MUJOCO_GL", None)  # a back end that is missing breaks `import mujoco`
+    from envtf_lit.figures.video import working_backend
+
+    backend = working_backend()
+    return "no GL works: videos show the links as lines" if backend == "disabled" else backend

@@ -1,0 +1,88 @@
+"""What a measurement was made on, and how it is timed."""
+
+import os
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from statistics import median
+from typing import Any
+
+import torch
+
+from envtf_lit.errors import UserError
+from envtf_lit.files import pick_device
+from envtf_lit.options.schema import Precision
+
+PACKAGES = ("torch", "lightning", "gymnasium", "mujoco", "numpy")
+
+
+def bench_device(name: str | None) -> torch.device:
+    """The named device, or by default the accelerator if there is one.
+
+    Raises:
+        UserError: torch does not know or have it.
+    """
+    if name is None:
+        return pick_device()
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # an assertion where torch was built without it
+        reason = str(error).splitlines()[0]
+        raise UserError(f"No device {name!r} here ({reason}): leave --device out, or take cpu.") from None
+    return device
+
+
+def hardware(device: torch.device) -> dict[str, Any]:
+    """The device by its name, and the CPU's cores."""
+    named = getattr(torch.get_device_module(device), "get_device_name", None)
+    return {
+        "device": f"{device.type} ({platform.processor() or platform.machine()})" if named is None else named(device),
+        "cores": os.cpu_count(),
+    }
+
+
+def facts(device: torch.device, precision: Precision) -> dict[str, Any]:
+    """Device, threads, load and versions: what belongs beside every timing."""
+    return {
+        **hardware(device),
+        "threads": torch.get_num_threads(),
+        "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "precision": precision,
+        "python": platform.python_version(),
+        **{package: version(package) for package in PACKAGES},
+    }
+
+
+def seconds(action: Callable[[], object], device: torch.device) -> float:
+    """Wall time of an action, to the end of what it set going on the device."""
+    synchronise(device)
+    begin = time.perf_counter()
+    action()
+    synchronise(device)
+    return time.perf_counter() - begin
+
+
+def synchronise(device: torch.device) -> None:
+    """Waits for the device; the CPU is never behind."""
+    if device.type != "cpu":
+        torch.accelerator.synchronize(device)
+
+
+def in_turns(actions: dict[str, Callable[[], float]], rounds: int, *, warm_up: int = 1) -> list[dict[str, float]]:
+    """Seconds of each action in each round, all of them in turn, after so many rounds that warm up.
+
+    Whatever else the machine does then falls on all of them alike.
+    """
+    return [{name: action() for name, action in actions.items()} for _ in range(warm_up + rounds)][warm_up:]
+
+
+def typical(rounds: list[dict[str, float]], name: str) -> float:
+    """Median seconds of an action."""
+    return median(values[name] for values in rounds)
+
+
+def ratio(rounds: list[dict[str, float]], slow: str, fast: str) -> float:
+    """How many times as long one action takes as another: the median of each round's own ratio."""
+    return median(values[slow] / values[fast] for values in rounds)

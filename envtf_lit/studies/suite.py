@@ -1,0 +1,308 @@
+"""The world models that are compared throughout, trained alike on one of the zoo's datasets.
+
+The transformer, the same transformer with a context of one step, and the ensemble: what is measured of world models is
+measured of these three, and models that lie there already, trained with the same settings, are not trained again.
+"""
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.options import DownloadOptions
+from envtf_lit.data.sources.fetch import sha256
+from envtf_lit.data.sources.files import load_dataset
+from envtf_lit.errors import UserError, did_you_mean
+from envtf_lit.files import pick_device, read_json, write_json
+from envtf_lit.options.schema import Precision
+from envtf_lit.pipeline.download import download
+from envtf_lit.pipeline.params import Params, check_ranges
+from envtf_lit.pipeline.stage import CARD, DATASET, run_settings
+from envtf_lit.robots.tasks import Robot, Task, get_task
+from envtf_lit.studies.machine import hardware
+from envtf_lit.training import run_folder
+from envtf_lit.world_models.fit import fit_world_model
+from envtf_lit.world_models.options import EnsembleOptions, ModelOptions, TrainModelOptions, check_world_model
+from envtf_lit.world_models.store import load_world_model
+from envtf_lit.world_models.uncertainty.recalibration import calibration_split
+from envtf_lit.zoo.snapshots import describe_origin
+
+MODELS = ("transformer", "context_1", "ensemble")  # their names in every table, figure and file
+PHYSICS = "physics"  # what stands beside them under that name, so that no other model may have it
+WORDS = ("trained_with", "note")  # of a dataset's origin: about the whole series, of which a tier may use a part
+SHARED = ("seed", "threads", "precision", "compile")  # options that a suite has in common with `Params`
+FORMAT = 3  # of saved transformers; those of before cannot be read and are trained anew
+WORK = Path(".envtf/suite")  # where suites are kept unless told otherwise
+
+
+@dataclass(frozen=True)
+class SuiteOptions:
+    """What the models of a suite share, and their budgets.
+
+    Attributes:
+        transitions: rows of the zoo's dataset.
+        updates: gradient steps of the transformer and of its ablation, which sees as many steps per update.
+        windows: of `context` steps per update of the transformer.
+        context: of the transformer, steps.
+        ensemble: the ensemble and its budget; it stops early.
+        seed: of data and training.
+        threads: CPU threads.
+        precision: of matrix products in training.
+        compile: as in `Params`; the models are measured through torch.compile, too.
+    """
+
+    transitions: int = 100_000
+    updates: int = 6_000
+    windows: int = TrainModelOptions().batch_size
+    context: int = ModelOptions().context
+    ensemble: EnsembleOptions = field(default_factory=EnsembleOptions)
+    seed: int = 0
+    threads: int = 2
+    precision: Precision = "bf16"
+    compile: bool = False
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Trained models on disk; `load_world_model(suite.folders[name])` gives one.
+
+    Attributes:
+        task: robot and tier.
+        robot: its robot.
+        options: what it was made with.
+        dataset: the file that all models were trained on.
+        folders: by the model's name.
+        seconds: of training, by the model's name, as measured when it was trained.
+        updates: gradient steps that it was trained for, by the model's name; the ensemble stops early.
+    """
+
+    task: str
+    robot: Robot
+    options: SuiteOptions
+    dataset: Path
+    folders: dict[str, Path]
+    seconds: dict[str, float]
+    updates: dict[str, int]
+
+    @property
+    def costs(self) -> dict[str, float]:
+        """`robot.model.train_seconds` and `robot.model.updates` of every model."""
+        kinds = {"train_seconds": self.seconds, "updates": self.updates}
+        return {f"{self.robot.name}.{name}.{kind}": value for kind, by in kinds.items() for name, value in by.items()}
+
+    def split(self) -> tuple[OfflineDataset, OfflineDataset | None, OfflineDataset]:
+        """The episodes that every model was trained on, calibrated on (if there are any), and neither."""
+        training, held_out = load_dataset(self.dataset).split(TrainModelOptions().held_out, seed=self.options.seed)
+        return training, *calibration_split(held_out)
+
+
+def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
+    """What a comparison's numbers depend on beside the models, under flat keys: `tier`, `suite.…`, `versions.…`.
+
+    Args:
+        tier: of the data.
+        options: of the data and the models.
+        measured: dataclasses that say what is measured, under the name that goes before their keys.
+    """
+    kept = ("transitions", "updates", "windows", "context", *SHARED)
+    return {
+        "tier": tier,
+        **{f"suite.{name}": getattr(options, name) for name in kept},
+        **{f"{prefix}.{name}": value for prefix, what in measured.items() for name, value in asdict(what).items()},
+        **{f"versions.{name}": version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")},
+    }
+
+
+def heading(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
+    """What stands at the head of a comparison's file: `flat_settings`, `suite.ensemble.…` and `machine.…`.
+
+    `kept` asks for neither of the latter: the models' bytes tell how they were trained, and the machine hardly counts.
+    """
+    ensemble = {f"suite.ensemble.{name}": value for name, value in _plain(asdict(options.ensemble)).items()}
+    machine = {f"machine.{name}": value for name, value in hardware(pick_device()).items()}
+    return flat_settings(tier, options, **measured) | ensemble | machine
+
+
+def kept(home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path], measure: Callable[[], Any]) -> Any:
+    """What a measurement gives, as JSON has it: now, or when it was made with these settings on the same inputs.
+
+    Args:
+        home: folder below which it is kept.
+        name: of the measurement.
+        settings: as `flat_settings` has them.
+        inputs: files and folders whose bytes count.
+        measure: makes it.
+    """
+    place = run_folder(home, name, settings, inputs).with_suffix(".json")
+    if not place.exists():
+        write_json(place, measure())
+    return read_json(place)
+
+
+def measurable(folder: Path, options: SuiteOptions) -> Any:
+    """A world model as it is measured: on the accelerator if there is one, through torch.compile if the suite is."""
+    return load_world_model(folder, fused=options.compile).to(pick_device())
+
+
+def other_folders(others: Mapping[str, str], tasks: Sequence[Task]) -> dict[str, dict[str, Path]]:
+    """Folders of models that are none of the suite's, by task and name; each is read, so that none fails hours later.
+
+    Args:
+        others: name to folder; `{task}` and `{robot}` in a folder stand for those names.
+        tasks: that the models are compared on.
+
+    Raises:
+        UserError: a name that is taken or holds a dot, or a folder without a world model of the robot.
+    """
+    for name in others:
+        if name in (*MODELS, PHYSICS) or "." in name:
+            raise UserError(f"A model cannot be called {name!r} here: choose a name of your own, without dots.")
+    return {task.name: {name: _folder_of(folder, task) for name, folder in others.items()} for task in tasks}
+
+
+def _folder_of(pattern: str, task: Task) -> Path:
+    """The task's folder, which holds a model of its robot."""
+    folder, robot = Path(pattern.replace("{task}", task.name).replace("{robot}", task.robot.name)), task.robot
+    model = load_world_model(folder)
+    if (model.observation_dim, model.action_dim) != (robot.observation_dim, robot.action_dim):
+        raise UserError(f"{folder} holds a world model of another robot: give one of {robot.name}.")
+    return folder
+
+
+def build_suite(
+    task: str, root: Path, options: SuiteOptions, *, models: Sequence[str] = MODELS, progress: bool = True
+) -> Suite:
+    """Collects the task's dataset and trains the models, all below `root / task`; what is there is kept.
+
+    Args:
+        task: robot and tier, such as `hopper-medium`.
+        root: folder of suites.
+        options: of the data and the models.
+        models: which of `MODELS`.
+        progress: shows bars.
+
+    Raises:
+        UserError: an unknown task or model, or options that are out of range or contradict each other.
+    """
+    for name in models:
+        if name not in MODELS:
+            raise UserError(f"Unknown model {name!r}: {did_you_mean(name, MODELS)}")
+    home, params = root / task, {name: model_params(name, task, options) for name in models}
+    key = {"task": task, "transitions": options.transitions, "seed": options.seed}
+    origin = _plain(describe_origin(get_task(task), options.transitions, options.seed))
+    key |= {"origin": {name: value for name, value in origin.items() if name not in WORDS}}
+    shared, card = replace(Params(), task=task, **_common(options)), home / CARD
+    # a record that is older than this key is judged by the dataset's card
+    older = {"origin": {name: read_json(card).get(name) for name in key["origin"]}} if card.exists() else {}
+    _unless_done(home / "data.json", key, lambda: download(shared, home, progress=progress), older)
+    suite = Suite(task, get_task(task).robot, options, home / DATASET, {}, {}, {})
+    for name in models:
+        add_model(suite, name, params[name].train_model, progress=progress)
+    return suite
+
+
+def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: bool = True) -> None:
+    """Trains a model on a suite's dataset and enters it there; one that lies there, trained alike, is kept.
+
+    Args:
+        suite: gives data, seed, threads and precision.
+        name: of the model, and of its folder.
+        options: of the model and its training.
+        progress: shows a bar.
+
+    Raises:
+        UserError: options that contradict each other.
+    """
+    check_world_model(options)
+    home, shared = suite.dataset.parents[1], suite.options
+    params = replace(Params(), task=suite.task, train_model=options, **_common(shared))
+    key = {"task": suite.task, "transitions": shared.transitions, **{name: getattr(shared, name) for name in SHARED}}
+    key |= {"train_model": _plain(asdict(options)), "dataset": sha256(suite.dataset)}
+    key |= {"format": FORMAT} if options.ensemble is None else {}
+    suite.folders[name] = home / "models" / name
+    train = partial(_train, params, suite.dataset, suite.folders[name], home, progress)
+    record = home / "models" / f"{name}.json"
+    # an option that is younger than the record had its default when that was written
+    older: dict[str, Any] = {"train_model": _plain(asdict(TrainModelOptions())), "compile": False}
+    if record.exists() and record.stat().st_mtime >= suite.dataset.stat().st_mtime:  # trained on what lies there
+        older["dataset"] = key["dataset"]
+    suite.seconds[name] = _unless_done(record, key, train, older)
+    epochs = len((suite.folders[name] / "curves.csv").read_text().splitlines()) - 1  # the first line names columns
+    suite.updates[name] = epochs * (options.ensemble or options).updates_per_epoch
+
+
+def _plain(options: dict[str, Any]) -> dict[str, Any]:
+    """As JSON has them, with lists for tuples."""
+    return json.loads(json.dumps(options))
+
+
+def _common(options: SuiteOptions) -> dict[str, Any]:
+    """What the stages' parameters take over from the suite's."""
+    download = DownloadOptions(transitions=options.transitions)
+    return {name: getattr(options, name) for name in SHARED} | {"download": download}
+
+
+def model_params(name: str, task: str, options: SuiteOptions) -> Params:
+    """The parameters that train one of `MODELS`.
+
+    Raises:
+        UserError: options that are out of range or contradict each other.
+    """
+    train = TrainModelOptions(
+        updates=options.updates, updates_per_epoch=min(1_000, options.updates), batch_size=options.windows
+    )
+    train = replace(train, model=replace(train.model, context=options.context))
+    if name == "context_1":  # windows of one step, as many steps per update
+        model = replace(train.model, context=1)
+        train = replace(train, model=model, batch_size=train.batch_size * options.context)
+    elif name == "ensemble":
+        train = TrainModelOptions(ensemble=options.ensemble)  # one for every budget of the transformer's
+    params = replace(Params(), task=task, train_model=train, **_common(options))
+    check_ranges(params)
+    check_world_model(train)
+    return params
+
+
+def _unless_done(record: Path, settings: dict[str, Any], work: Callable[[], object], older: dict[str, Any]) -> float:
+    """Seconds that the work took, now or when it was done with the same settings; `older` completes old records."""
+    if record.exists():
+        done = read_json(record)
+        if _over(older, done.get("settings")) == settings:
+            return done["seconds"]
+    record.unlink(missing_ok=True)  # what lies there is about to be replaced
+    begin = time.perf_counter()
+    work()
+    seconds = time.perf_counter() - begin
+    write_json(record, {"settings": settings, "seconds": round(seconds, 3)})
+    return round(seconds, 3)
+
+
+def _over(defaults: Any, given: Any) -> Any:
+    """What is given, completed by defaults, section by section."""
+    if not (isinstance(defaults, dict) and isinstance(given, dict)):
+        return given
+    return defaults | {name: _over(defaults.get(name), value) for name, value in given.items()}
+
+
+def _train(params: Params, dataset: Path, folder: Path, home: Path, progress: bool) -> None:
+    torch.set_num_threads(params.threads)
+    L.seed_everything(params.seed, verbose=False)
+    fit_world_model(
+        params.train_model,
+        dataset,
+        folder,
+        seed=params.seed,
+        precision=params.precision,
+        compile=params.compile,
+        settings=run_settings(params, asdict(params.train_model)),
+        root=home,
+        progress=progress,
+    )

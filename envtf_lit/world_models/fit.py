@@ -1,0 +1,92 @@
+"""From a dataset file to a published world model."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from envtf_lit.files import replacing
+from envtf_lit.options.schema import Precision
+from envtf_lit.training import fit, record_training, run_folder
+from envtf_lit.world_models.lit import lit_world_model, window_data
+from envtf_lit.world_models.options import TrainModelOptions
+from envtf_lit.world_models.store import save_world_model
+from envtf_lit.world_models.termination import TERMINATION, learn_termination, save_termination
+
+
+def fit_world_model(
+    options: TrainModelOptions,
+    dataset: Path,
+    target: Path,
+    *,
+    seed: int,
+    precision: Precision,
+    compile: bool,
+    settings: dict[str, Any],
+    root: Path = Path("."),
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Trains a world model on a dataset file and writes its folder.
+
+    Args:
+        options: of the model and its training.
+        dataset: HDF5 or NPZ.
+        target: folder of the weights, metrics, curves and resolved options.
+        seed: of everything random; global seeds and threads are the caller's.
+        precision: of matrix products in training.
+        compile: trains through torch.compile.
+        settings: all that the result depends on beside the dataset, the options among it: what is written as the
+            resolved options, and what a killed run is found again by.
+        root: below it lies what a killed run continues from.
+        progress: shows a bar.
+
+    Returns:
+        Parameters, epoch of the kept weights, and their held-out errors; those of the termination head, too, where
+        the data are of a robot whose rule is unknown, and some episode terminates.
+    """
+
+    budget = options.ensemble or options
+    data = window_data(str(dataset), options, seed=seed)
+    lit = lit_world_model(data.observation_dim, data.action_dim, options, seed=seed, compile=compile)
+    curves = fit(
+        lit,
+        data,
+        run=run_folder(root, "train_model", settings, [dataset]),
+        epochs=budget.updates // budget.updates_per_epoch,
+        precision=precision,
+        progress=progress,
+        monitor=lit.monitor,
+        gradient_clip=lit.gradient_clip,
+    )
+    best = curves.rows[-1] if (name := lit.monitor) is None else min(curves.rows, key=lambda row: row[name])
+    return publish_world_model(target, lit, data, curves, best, settings)
+
+
+def publish_world_model(
+    target: Path, lit: Any, data: Any, curves: Any, best: Mapping[str, float], settings: dict[str, Any]
+) -> dict[str, Any]:
+    """Fits what comes after training, uncertainty and perhaps a termination head, and writes a world model's folder.
+
+    Args:
+        target: folder of the weights, metrics, curves and resolved options.
+        lit: the `LitWorldModel` that holds the weights to keep.
+        data: the `WindowData` that it was trained on, set up.
+        curves: the `Curves` of the training.
+        best: the row of them that belongs to the weights; it may lack what was not logged.
+        settings: the resolved options.
+
+    Returns:
+        As `fit_world_model`.
+    """
+
+    lit.fit_uncertainty(data)
+    names = {"epoch": "epoch", "open_loop_error": "val/open_loop_error", "val_loss": "val/loss"}
+    metrics: dict[str, Any] = {"parameters": sum(p.numel() for p in lit.kept.parameters())}
+    metrics |= {name: best[column] for name, column in names.items() if column in best}
+    head = learn_termination(data.train, seed=lit.seed) if data.dataset.task is None else None
+    with replacing(target) as folder:
+        save_world_model(folder, lit.kept)
+        if head is not None:
+            save_termination(folder / TERMINATION, head)
+            metrics |= head.scores(data.held_out)
+        record_training(folder, metrics, settings, curves)
+    return metrics
