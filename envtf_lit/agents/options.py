@@ -1,24 +1,23 @@
-"""The options of policies and of their training."""
+"""The options that all policies share; an algorithm's own stand in its file."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
-from envtf_lit.errors import UserError
-from envtf_lit.imagination.options import ImaginationOptions
+from envtf_lit.options.numbers import Count, Natural, NonzeroShare, Positive, Share
 from envtf_lit.options.schema import check_epochs
+
+NO_WORLD_MODEL = "none"
 
 
 @dataclass(frozen=True)
-class PolicyOptions:
-    """Conservative Q-Learning (Kumar et al. 2020) on data, or on data and imagination.
+class CommonOptions:
+    """What all policies share, so that they are compared with equal budgets, networks and rows.
 
     Attributes:
         updates: gradient steps in all, the warm start included.
         updates_per_epoch: gradient steps between two log lines (and resumable checkpoints).
-        updates_per_step: gradient steps per Lightning training step.
         batch_size: rows per gradient step.
         hidden: units of each hidden layer of actor and critics.
-        critics: Q-functions, of which the target takes the smallest.
         layer_norm: LayerNorm in the critics.
         discount: of future rewards, per step.
         normalise_returns: divides rewards by the standard deviation of the log's Monte-Carlo returns, so that Q has
@@ -30,84 +29,42 @@ class PolicyOptions:
         actor_learning_rate: Adam's.
         actor_schedule: of the actor's learning rate after the warm start: `constant`, or half a cosine to zero.
         critic_learning_rate: Adam's.
-        cql_weight: weight of the conservative term.
-        initial_alpha: weight of the entropy in the actor's objective at the start; learned from there on.
-        clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log.
-        sampled_actions: actions of each kind (uniform, pi(s), pi(s')) in the log-sum-exp.
-        temperature: of the log-sum-exp.
-        warm_start: first updates, in which the critics fit Monte-Carlo returns and the actor clones the data.
-        warm_start_learning_rate: Adam's, of both, during the warm start.
+        warm_start: share of the updates, the first ones, in which critics fit Monte-Carlo returns and the actor clones
+            the data, for algorithms that have both.
         actor_average: share of the actor that enters the averaged actor at each update; the average is what is saved.
-        imagination: None trains on data alone.
     """
 
-    updates: int = 4_500
-    updates_per_epoch: int = 500
-    updates_per_step: int = 10
-    batch_size: int = 256
-    hidden: tuple[int, ...] = (256, 256)
-    critics: int = 2
+    updates: Count = 4_500
+    updates_per_epoch: Count = 500
+    batch_size: Count = 256
+    hidden: tuple[Count, ...] = (256, 256)
     layer_norm: bool = True
-    discount: float = 0.997
+    discount: Share = 0.997
     normalise_returns: bool = True
-    return_temperature: float | None = 0.1
-    n_step: int = 20
-    target_rate: float = 0.005
-    actor_learning_rate: float = 0.0003
+    return_temperature: Positive | None = 0.1
+    n_step: Count = 20
+    target_rate: NonzeroShare = 0.005
+    actor_learning_rate: Positive = 0.0003
     actor_schedule: Literal["constant", "cosine"] = "cosine"
-    critic_learning_rate: float = 0.0003
-    cql_weight: float = 0.1
-    initial_alpha: float = 0.01
-    clone_weight: float = 0.25
-    sampled_actions: int = 2
-    temperature: float = 1.0
-    warm_start: int = 1_500
-    warm_start_learning_rate: float = 0.001
-    actor_average: float = 0.002
-    imagination: ImaginationOptions | None = None
+    critic_learning_rate: Positive = 0.0003
+    warm_start: Share = 0.3333
+    actor_average: NonzeroShare = 0.002
+
+    def __post_init__(self) -> None:
+        check_epochs(self)
+
+    @property
+    def warm_updates(self) -> int:
+        """Updates of the warm start."""
+        return round(self.warm_start * self.updates)
 
 
 @dataclass(frozen=True)
-class TrainPolicyOptions:
-    """The two policies that are compared, with equal budgets.
+class PolicyOptions(CommonOptions):
+    """The options of any one policy.
 
     Attributes:
-        cql: data alone.
-        et_cql: data and imagination.
+        world_model: the section below `train_model` whose model it imagines in; `none` learns from data alone.
     """
 
-    cql: PolicyOptions = field(default_factory=PolicyOptions)
-    et_cql: PolicyOptions = field(default_factory=lambda: PolicyOptions(imagination=ImaginationOptions()))
-
-
-def check_policy(options: PolicyOptions, section: str) -> None:
-    """The rules that tie a policy's options together, whether or not it imagines.
-
-    Args:
-        options: of the policy.
-        section: what errors call them.
-
-    Raises:
-        UserError: one is broken.
-    """
-    check_epochs(section, options)
-    if options.updates_per_epoch % options.updates_per_step:
-        raise UserError(
-            f"{section}.updates_per_epoch is {options.updates_per_epoch}: take a multiple of updates_per_step "
-            f"({options.updates_per_step})."
-        )
-    if options.warm_start > options.updates:
-        raise UserError(
-            f"{section}.warm_start is {options.warm_start}, more than its updates ({options.updates}): the warm start "
-            "is a part of them."
-        )
-
-
-def check_no_imagination(options: PolicyOptions, section: str) -> None:
-    """A policy that sees data alone has no section for imagination.
-
-    Raises:
-        UserError: it has one.
-    """
-    if options.imagination is not None:
-        raise UserError(f"{section}.imagination must be null: this policy sees data alone, et_cql imagines.")
+    world_model: str = NO_WORLD_MODEL

@@ -1,141 +1,227 @@
-"""The actor climbs its imagined return: the gradient runs through the world model, step by step."""
+"""Policy improvement by the gradient of imagined returns, which runs through the world model step by step."""
+
+from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
+from envtf_lit.agents.agent import Agent, Batch, Logs, Phase, follow
 from envtf_lit.agents.networks import StateValue
-from envtf_lit.imagination.options import ValueGradientOptions
-from envtf_lit.imagination.rollouts import Imagination
+from envtf_lit.agents.sac import held_fixed
+from envtf_lit.agents.warm_start import WarmStart
+from envtf_lit.imagination.buffer import Imagination
+from envtf_lit.imagination.histories import Histories
+from envtf_lit.imagination.rollouts import Rollouts, gather_steps
+from envtf_lit.options.numbers import Count, NonNegative, NonzeroShare, Positive
 from envtf_lit.policy import TanhGaussianActor
+from envtf_lit.world_models.unroll import Step, unroll
 
-VALUE_BATCH = 256  # states per gradient step of the state value
-HIDDEN = (256, 256)  # its units
+if TYPE_CHECKING:
+    from envtf_lit.agents.et_cql import ETCQL
+
+HIDDEN = (256, 256)  # units of the state value
+LEARNING_RATE = 0.001  # of the state value
+BATCH = 256  # states per gradient step of the state value
+PASSES = 4  # of the state value over the steps of each update
+TRACE = 0.95  # lambda of the state value's TD(lambda) targets
+TARGET_RATE = 0.3  # share of the state value that enters its target at each update of the actor
+OLDEST = 1_000  # steps after which a rollout begins anew at a real state
+BETAS = (0.7, 0.95)  # of the actor's Adam, as in SHAC
+CLIP = 1.0  # largest norm of the actor's gradient
 
 
 @dataclass(frozen=True)
-class Paths:
-    """H consecutive steps of B imagined rollouts; what comes after a fall means nothing.
+class ValueGradientOptions:
+    """The last updates of a policy that imagines: its actor follows the gradient of imagined returns (SHAC, Xu 2022).
 
     Attributes:
-        observations, next_observations: (H, B, S).
-        actions: (H, B, A).
-        rewards: (H, B), in units of the agent's returns.
-        fell: (H, B) bool, the robot's rule at each next observation.
+        updates: of all the policy's updates, the last so many; each is one of the actor.
+        rollouts: imagined at a time; each is carried on from update to update until the robot falls.
+        horizon: steps of each rollout per update, after which a learned state value stands for what follows.
+        learning_rate: Adam's, of the actor; reached after a tenth of these updates, from there linearly to zero.
+        clone_weight: weight in the actor's objective of cloning the real rows' actions.
+        actor_average: share of the actor that enters the averaged actor at each of these updates.
     """
 
-    observations: Tensor
-    actions: Tensor
-    rewards: Tensor
-    next_observations: Tensor
-    fell: Tensor
-
-    @property
-    def alive(self) -> Tensor:
-        """(H + 1, B), 1 where the robot has not fallen before that step; the last row is what outlives the path."""
-        standing = (~self.fell).float().cumprod(0)
-        return torch.cat([torch.ones_like(standing[:1]), standing])
+    updates: Count = 400
+    rollouts: Count = 64
+    horizon: Count = 16
+    learning_rate: Positive = 0.001
+    clone_weight: NonNegative = 0.05
+    actor_average: NonzeroShare = 0.05
 
 
-class ValueGradient(nn.Module):
-    """Policy improvement by the gradient of imagined returns (SVG, Heess et al. 2015; as in SHAC, Xu et al. 2022).
-
-    Imagined robots are carried on from update to update, `horizon` steps at a time, so that the actor meets the states
-    that it leads to itself. A state value, learned on those very paths, stands for what follows a path.
+class StateValues(nn.Module):
+    """`V(s)` and its slow target, which stand for what follows an imagined path.
 
     Args:
         observation_dim: S.
-        options: of the paths and of the optimisation.
     """
 
-    def __init__(self, observation_dim: int, options: ValueGradientOptions) -> None:
+    def __init__(self, observation_dim: int) -> None:
         super().__init__()
-        self.options = options
         self.value = StateValue(observation_dim, hidden=HIDDEN)
         self.target_value = copy.deepcopy(self.value).requires_grad_(False)
-        self.restart()
 
-    def restart(self) -> None:
-        """Forgets the rollouts under way; the next path begins at real states."""
-        self._histories: tuple[Tensor, Tensor, Tensor] | None = None
-
-    def paths(
-        self, actor: TanhGaussianActor, imagination: Imagination, scale: Tensor, generator: torch.Generator
-    ) -> Paths:
-        """The next `horizon` steps of all rollouts under the actor's sampled actions, differentiable in the actor.
-
-        Each path runs in a world model of its own, drawn from the posterior as `imagination.options.posterior` says.
-
-        Args:
-            scale: by which rewards are divided.
-            generator: of starts, worlds, actions and next states.
-        """
-        model, options = imagination.model, imagination.options
-        if self._histories is None:
-            self._histories = imagination.starts.draw(self.options.rollouts, options.history, generator)
-            self._age = torch.zeros_like(self._histories[2])
-        with torch.no_grad():
-            state = model.init(*self._histories, posterior=options.posterior, generator=generator)
-        steps = []
-        for _ in range(self.options.horizon):
-            observation = model.current(state)
-            action, _ = actor.sample(observation, generator=generator)
-            state, prediction = model.step(state, action, mode=options.mode, generator=generator)
-            following = prediction.observation
-            steps.append((observation, action, prediction.reward / scale, following, imagination.terminated(following)))
-        paths = Paths(*(torch.stack(column) for column in zip(*steps, strict=True)))
-        self._carry_on(paths, imagination, generator)
-        return paths
-
-    @torch.no_grad()
-    def _carry_on(self, paths: Paths, imagination: Imagination, generator: torch.Generator) -> None:
-        """Where the next paths begin: at the ends of these, but at real states where robots fell or grew old."""
-        history, horizon = imagination.options.history, self.options.horizon
-        observations = torch.cat([paths.observations[horizon - history :], paths.next_observations[-1:]])
-        actions = paths.actions[horizon - history :]
-        fresh = imagination.starts.draw(self.options.rollouts, history, generator)
-        self._age += horizon
-        ended = paths.fell.any(0) | (self._age >= self.options.max_steps)  # (B,)
-        self._age[ended] = 0
-        ends = observations.transpose(0, 1), actions.transpose(0, 1), torch.full_like(fresh[2], history + 1)
-        self._histories = (
-            torch.where(ended[:, None, None], fresh[0], ends[0]),
-            torch.where(ended[:, None, None], fresh[1], ends[1]),
-            torch.where(ended, fresh[2], ends[2]),
-        )
-
-    def imagined_return(self, paths: Paths, discount: float) -> Tensor:
+    def imagined_return(self, paths: Rollouts, discount: float) -> Tensor:
         """(B,) `sum_k discount^k r_k + discount^H V(s_H)`, up to the fall (Xu et al. 2022, equation 5)."""
-        weights = discount ** torch.arange(len(paths.rewards) + 1, device=paths.rewards.device)[:, None] * paths.alive
+        powers = discount ** torch.arange(len(paths.rewards) + 1, device=paths.rewards.device)[:, None]
+        weights = powers * standing(paths)
         return (weights[:-1] * paths.rewards).sum(0) + weights[-1] * self.value(paths.next_observations[-1])
 
     @torch.no_grad()
-    def value_targets(self, paths: Paths, discount: float) -> Tensor:
+    def value_targets(self, paths: Rollouts, discount: float) -> Tensor:
         """(H, B) TD(lambda) targets under the slow state value (Xu et al. 2022, equations 6 and 7)."""
         later = self.target_value(paths.next_observations)
         target, targets = later[-1], torch.empty_like(paths.rewards)
         for t in reversed(range(len(targets))):
-            target = (1.0 - self.options.trace) * later[t] + self.options.trace * target
-            target = targets[t] = paths.rewards[t] + discount * ~paths.fell[t] * target
+            target = (1.0 - TRACE) * later[t] + TRACE * target
+            target = targets[t] = paths.rewards[t] + discount * ~paths.terminated[t] * target
         return targets
 
-    def lessons(self, paths: Paths, discount: float, generator: torch.Generator) -> Iterator[tuple[Tensor, Tensor]]:
-        """Batches of states and their targets: all that was lived through, `value_passes` times in random order."""
-        lived = paths.alive[:-1].flatten() > 0
-        states = paths.observations.detach().flatten(0, 1)[lived]
-        targets = self.value_targets(paths, discount).flatten()[lived]
-        for _ in range(self.options.value_passes):
+    def value_batches(
+        self, paths: Rollouts, discount: float, generator: torch.Generator
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Batches of visited states and their targets, several times in random order."""
+        visited = standing(paths)[:-1].flatten() > 0
+        states = paths.observations.detach().flatten(0, 1)[visited]
+        targets = self.value_targets(paths, discount).flatten()[visited]
+        for _ in range(PASSES):
             order = torch.randperm(len(states), generator=generator, device=states.device)
-            for rows in order.split(VALUE_BATCH):
+            for rows in order.split(BATCH):
                 yield states[rows], targets[rows]
 
     def value_loss(self, observations: Tensor, returns: Tensor) -> Tensor:
         """`(V(s) - G)^2`, mean over the batch."""
         return (self.value(observations) - returns).square().mean()
 
-    def rate(self, done: float) -> float:
-        """Of the actor's learning rate after this share of the updates: up over the first tenth, then down to zero."""
-        return min(10.0 * done, (1.0 - done) / 0.9)
+
+def standing(paths: Rollouts) -> Tensor:
+    """(H + 1, B), 1 where the robot has not fallen before that step; the last row is what outlives the path."""
+    stands = (~paths.terminated).float().cumprod(0)
+    return torch.cat([torch.ones_like(stands[:1]), stands])
+
+
+class ImaginedPaths:
+    """Rollouts under way, carried on `horizon` steps at a time, so that the actor meets the states it leads to itself.
+
+    Args:
+        imagination: the world model and where rollouts begin.
+        options: number of rollouts and their horizon.
+    """
+
+    def __init__(self, imagination: Imagination, options: ValueGradientOptions) -> None:
+        self.imagination, self.options = imagination, options
+        self.histories: Histories | None = None
+
+    def next(self, actor: TanhGaussianActor, scale: Tensor, generator: torch.Generator) -> Rollouts:
+        """The next `horizon` steps under the actor's sampled actions, differentiable in the actor.
+
+        Each path runs in a world model of its own, drawn from the posterior as the rollouts' options say. No rollout
+        leaves where its robot falls: what comes after means nothing.
+
+        Args:
+            actor: acts.
+            scale: by which rewards are divided.
+            generator: of starts, worlds, actions and next states.
+        """
+        model, o = self.imagination.model, self.imagination.options
+        if self.histories is None:
+            self.histories = self.imagination.starts.draw(self.options.rollouts, o.history, generator)
+            self.age = torch.zeros_like(self.histories.lengths)
+        with torch.no_grad():
+            state = self.histories.begin(model, posterior=o.posterior, generator=generator)
+
+        def act(t: int, rows: Tensor, observation: Tensor) -> Tensor:
+            return actor.sample(observation, generator=generator)[0]
+
+        steps = unroll(model, state, act, self.options.horizon, mode=o.mode, generator=generator)
+        paths = gather_steps(map(self._with_falls, steps), self.options.rollouts)
+        self._carry_on(paths, generator)
+        return replace(paths, rewards=paths.rewards / scale)
+
+    def _with_falls(self, step: Step) -> tuple[Step, Tensor, Tensor]:
+        fell = self.imagination.terminated(step.prediction.observation)
+        return step, fell, torch.zeros_like(fell)
+
+    @torch.no_grad()
+    def _carry_on(self, paths: Rollouts, generator: torch.Generator) -> None:
+        """Where the next paths begin: at the ends of these, but at real states where robots fell or grew old."""
+        history, horizon = self.imagination.options.history, self.options.horizon
+        observations = torch.cat([paths.observations[horizon - history :], paths.next_observations[-1:]])
+        actions = paths.actions[horizon - history :]
+        fresh = self.imagination.starts.draw(self.options.rollouts, history, generator)
+        self.age += horizon
+        ended = paths.terminated.any(0) | (self.age >= OLDEST)  # (B,)
+        self.age[ended] = 0
+        self.histories = Histories(
+            torch.where(ended[:, None, None], fresh.observations, observations.transpose(0, 1)),
+            torch.where(ended[:, None, None], fresh.actions, actions.transpose(0, 1)),
+            torch.where(ended, fresh.lengths, torch.full_like(fresh.lengths, history + 1)),
+        )
+
+
+class ValueWarmStart(WarmStart):
+    """A warm start in which a state value learns the log's returns, too."""
+
+    def update(self, agent: Agent, batch: Batch, done: int) -> Logs:
+        logs = super().update(agent, batch, done)
+        et_cql: ETCQL = agent  # pyright: ignore[reportAssignmentType]
+        agent.descend("value", et_cql.values.value_loss(batch["observations"], batch["returns"]))
+        if done == self.updates - 1:
+            et_cql.values.target_value.load_state_dict(et_cql.values.value.state_dict())
+        return logs
+
+
+class ValueGradient(Phase):
+    """The actor follows the gradient of imagined returns, kept near the real rows' actions (SVG, Heess et al. 2015).
+
+    A state value, learned on those very paths, stands for what follows a path (SHAC, Xu et al. 2022).
+
+    Args:
+        imagination: the world model and where rollouts begin.
+        options: of the paths and of the optimisation.
+    """
+
+    def __init__(self, imagination: Imagination, options: ValueGradientOptions) -> None:
+        self.options, self.updates = options, options.updates
+        self.paths = ImaginedPaths(imagination, options)
+
+    def begin_epoch(self, agent: Agent) -> None:
+        """Forgets the rollouts under way; the next path begins at real states."""
+        self.paths.histories = None
+
+    def update(self, agent: Agent, batch: Batch, done: int) -> Logs:
+        """One update of the actor, beginning at the averaged one; the state value then learns from the same paths."""
+        et_cql: ETCQL = agent  # pyright: ignore[reportAssignmentType]
+        if done == 0:
+            agent.actor.load_state_dict(agent.average_actor.state_dict())
+        with torch.autocast(agent.device.type, enabled=False):  # errors of bf16 would add up along the path
+            logs = self.value_gradient_step(et_cql, batch, done)
+        follow(et_cql.values.target_value, et_cql.values.value, TARGET_RATE)
+        follow(agent.average_actor, agent.actor, self.options.actor_average)
+        return logs
+
+    def value_gradient_step(self, agent: ETCQL, batch: Batch, done: int) -> Logs:
+        """One step of the actor along the gradient, and several of the state value."""
+        values, discount = agent.values, agent.options.discount
+        paths = self.paths.next(agent.actor, agent.return_scale, agent.generator)
+        with held_fixed(values.value):
+            imagined = values.imagined_return(paths, discount).mean()
+            clone_loss = agent.clone_loss(batch)
+            loss = self.options.clone_weight * clone_loss - imagined
+            agent.descend("actor_by_gradient", loss, rate=self.rate(done / self.updates), clip=CLIP)
+        value_loss = torch.zeros(())
+        for observations, targets in values.value_batches(paths, discount, agent.generator):
+            value_loss = values.value_loss(observations, targets)
+            agent.descend("value", value_loss)
+        return dict(imagined_value=imagined * agent.return_scale, value_loss=value_loss, clone_loss=clone_loss)
+
+    def rate(self, progress: float) -> float:
+        """The actor's learning rate after this share of the updates: up over the first tenth, then down to zero."""
+        return self.options.learning_rate * min(10.0 * progress, (1.0 - progress) / 0.9)

@@ -1,34 +1,33 @@
-"""Branched rollouts: from real states, under a policy, through any world model, until the robot falls."""
+"""Imagined rollouts: from real states, under a policy, through any world model, until the robot falls."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
-from envtf_lit.imagination.histories import BranchPoints, Starts, _some
-from envtf_lit.imagination.options import ImaginationOptions
+from envtf_lit.imagination.histories import Histories
 from envtf_lit.policy import Policy, TanhGaussianActor
 from envtf_lit.world_models.interface import Mode, Prediction, WorldModel
+from envtf_lit.world_models.unroll import Step, unroll
+
+Rule = Callable[[Tensor], Tensor]  # next observations (..., S) to bool (...): whether the robot has fallen
 
 
 @dataclass(frozen=True)
 class Rollouts:
-    """M imagined transitions, ordered by step and then by branch.
+    """B imagined rollouts of at most H steps; zeros stand where a rollout has ended before.
 
     Attributes:
-        observations, next_observations: (M, S).
-        actions: (M, A).
-        rewards: (M,), without any penalty.
-        terminated: (M,) bool, by the robot's rule.
-        halted: (M,) bool, where the rollout was given up because the model had left what it knows.
-        aleatoric: (M, S + 1) predicted spread of (next observation, reward), as `Prediction.aleatoric`.
-        uncertainty: (M,) `Prediction.uncertainty` of each transition.
-        branch: (M,) which rollout; step: (M,) how many imagined steps came before.
+        observations, next_observations: (H, B, S).
+        actions: (H, B, A).
+        rewards: (H, B), without any penalty.
+        terminated: (H, B) bool, by the robot's rule.
+        halted: (H, B) bool, where the rollout was given up because the model had left what it knows.
+        aleatoric: (H, B, S + 1) predicted spread of (next observation, reward), as `Prediction.aleatoric`.
+        uncertainty: (H, B) `Prediction.uncertainty` of each transition.
+        valid: (H, B) bool, steps that were taken.
     """
 
     observations: Tensor
@@ -39,35 +38,42 @@ class Rollouts:
     halted: Tensor
     aleatoric: Tensor
     uncertainty: Tensor
-    branch: Tensor
-    step: Tensor
+    valid: Tensor
 
     def __len__(self) -> int:
-        return len(self.rewards)
+        """Transitions."""
+        return int(self.valid.sum())
+
+    @classmethod
+    def joined(cls, parts: "list[Rollouts]") -> "Rollouts":
+        """Several batches side by side, as long as the longest."""
+        longest = max(len(part.valid) for part in parts)
+        padded = [[_padded(getattr(part, field.name), longest) for field in fields(cls)] for part in parts]
+        return cls(*(torch.cat(columns, 1) for columns in zip(*padded, strict=True)))
 
     def returns(self, rewards: Tensor, discount: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Multi-step transitions that run from each imagined step to the end of its rollout.
+        """Multi-step transitions that run from each step to the end of its rollout.
 
         Args:
-            rewards: (M,), `self.rewards` with whatever penalty.
+            rewards: (H, B), `self.rewards` with whatever penalty.
             discount: per step.
 
         Returns:
-            (M,) discounted sum of rewards; (M, S) where the rollout ends; (M,) what the value there counts for:
+            (H, B) discounted sum of rewards; (H, B, S) where the rollout ends; (H, B) what the value there counts for:
             `discount ** steps`, or zero if the robot fell.
         """
-        total, weight, end = rewards.clone(), discount * (~self.terminated).float(), self.next_observations.clone()
-        latest = torch.full((int(self.branch.max()) + 1,), -1, device=self.branch.device)
-        for step in range(int(self.step.max()), -1, -1):
-            rows = (self.step == step).nonzero()[:, 0]
-            following = latest[self.branch[rows]]  # the same rollout's next step
-            rows, following = rows[following >= 0], following[following >= 0]
-            total[rows] += discount * total[following]
-            weight[rows] = discount * weight[following]
-            end[rows] = end[following]
-            rows = (self.step == step).nonzero()[:, 0]
-            latest[self.branch[rows]] = rows
+        total, weight = rewards.clone(), discount * (~self.terminated).float()
+        end = self.next_observations.clone()
+        for t in range(len(rewards) - 2, -1, -1):
+            goes_on = self.valid[t + 1]
+            total[t] = torch.where(goes_on, rewards[t] + discount * total[t + 1], total[t])
+            weight[t] = torch.where(goes_on, discount * weight[t + 1], weight[t])
+            end[t] = torch.where(goes_on[:, None], end[t + 1], end[t])
         return total, end, weight
+
+
+def _padded(column: Tensor, length: int) -> Tensor:
+    return torch.cat([column, column.new_zeros(length - len(column), *column.shape[1:])])
 
 
 class NoisyPolicy:
@@ -88,11 +94,11 @@ class NoisyPolicy:
 def imagine(
     model: WorldModel,
     policy: Policy,
-    starts: tuple[Tensor, Tensor, Tensor] | Starts,
+    histories: Histories,
     *,
     horizon: int,
-    terminated: Callable[[Tensor], Tensor],
-    tail: int = 0,
+    terminated: Rule,
+    expansion: int = 0,
     novelty_limit: float | None = None,
     mode: Mode = "sample",
     posterior: float = 0.0,
@@ -104,134 +110,71 @@ def imagine(
     Rollouts that ended leave the batch, so that no work is spent on them.
 
     Args:
-        model: any world model; `starts` are the arguments of its `init`.
+        model: any world model.
         policy: acts on (B, S).
-        terminated: the robot's rule, next observations (B, S) to bool (B,).
+        histories: where rollouts begin.
+        horizon: steps of sampled actions.
+        terminated: the robot's rule.
+        expansion: further steps, with the policy's deterministic actions and mean predictions.
         novelty_limit: rollouts whose `Prediction.novelty` passes it end there, halted; None lets them go on.
-        tail: further steps, with the policy's deterministic actions and mean predictions.
-        mode: of `WorldModel.step`.
+        mode: of `WorldModel.step`, up to the horizon.
         posterior: of `WorldModel.init`.
         generator: of the actions and of sampled next states.
         batch_size: rollouts imagined at a time.
+
+    Raises:
+        UserError: a novelty limit is given and the model has no epistemic variance.
     """
-    parts: list[Rollouts] = []
-    count = len(starts[2])
-    for begin in range(0, count, batch_size):
-        branch = torch.arange(begin, min(begin + batch_size, count), device=starts[2].device)
-        state = model.init(*_some(starts, branch), posterior=posterior, generator=generator)
-        for step in range(horizon + tail):
-            actor, how = (policy, mode) if step < horizon else (_Deterministic(policy), "mean")
-            part, state = _advance(model, actor, state, branch, step, terminated, novelty_limit, how, generator)
-            parts.append(part)
-            alive = (~(part.terminated | part.halted)).nonzero()[:, 0]
-            if len(alive) == 0:
-                break
-            if len(alive) < len(branch):
-                state, branch = model.gather(state, alive), branch[alive]
-    return Rollouts(**{field.name: torch.cat([getattr(p, field.name) for p in parts]) for field in fields(Rollouts)})
+    rows = torch.arange(len(histories), device=histories.lengths.device)
+    parts = []
+    for some in rows.split(batch_size):
+        state = histories[some].begin(model, posterior=posterior, generator=generator)
+        ended = torch.zeros(len(some), dtype=torch.bool, device=some.device)
+
+        def act(t: int, rows: Tensor, observation: Tensor) -> Tensor:
+            return policy.act(observation, deterministic=t >= horizon, generator=generator)
+
+        def select(t: int, rows: Tensor, ended: Tensor = ended) -> Tensor | None:
+            over = ended[rows]
+            return (~over).nonzero()[:, 0] if t > 0 and bool(over.any()) else None
+
+        def how(t: int) -> Mode:
+            return mode if t < horizon else "mean"
+
+        steps = unroll(model, state, act, horizon + expansion, mode=how, select=select, generator=generator)
+        columns = []
+        for step in steps:
+            fell = terminated(step.prediction.observation)
+            halted = torch.zeros_like(fell)
+            if novelty_limit is not None:
+                halted = ~fell & (_novelty(step.prediction) > novelty_limit)
+            ended[step.rows] = fell | halted
+            columns.append((step, fell, halted))
+        parts.append(gather_steps(columns, len(some)))
+    return Rollouts.joined(parts)
 
 
-class Imagination:
-    """A world model at an agent's service: branched rollouts to learn from, whole episodes to be judged by.
+def gather_steps(steps: Iterable[tuple[Step, Tensor, Tensor]], count: int) -> Rollouts:
+    """Steps of rollouts, of which some may have ended, as whole columns.
 
     Args:
-        model: any world model, on `device`.
-        dataset: gives the states to branch from and the first states of episodes.
-        terminated: the robot's rule.
-        options: of the rollouts and of the judgement.
-        weights: (N,) chances of each row to be branched from; None draws uniformly.
+        steps: each with (R,) bool terminated and halted.
+        count: B, rollouts at the start.
     """
-
-    def __init__(
-        self,
-        model: WorldModel,
-        dataset: OfflineDataset,
-        terminated: Callable[[Tensor], Tensor],
-        options: ImaginationOptions,
-        device: torch.device | str = "cpu",
-        weights: Tensor | None = None,
-    ) -> None:
-        self.model, self.terminated, self.options = model, terminated, options
-        self.starts = BranchPoints(dataset, device, weights)
-        chosen = np.linspace(0, len(dataset.episode_starts) - 1, max(1, options.selection_episodes)).astype(int)
-        self.first = torch.as_tensor(dataset.observations[dataset.episode_starts[chosen]], device=device)
-
-    def rollouts(self, policy: Policy, generator: torch.Generator) -> Rollouts:
-        """New branched rollouts under the policy's sampled actions."""
-        o = self.options
-        starts = self.starts.draw_shared(o.branches, o.history, o.share, generator)
-        return imagine(
-            self.model,
-            policy,
-            starts,
-            horizon=o.horizon,
-            tail=o.tail,
-            terminated=self.terminated,
-            novelty_limit=o.novelty_limit,
-            mode=o.mode,
-            posterior=o.posterior,
-            generator=generator,
-        )
-
-    def imagined_return(self, policy: Policy) -> float:
-        """Mean undiscounted return of imagined episodes, from recorded first states, deterministic actions, mean model.
-
-        Episodes last `selection_steps`, unless the robot falls first.
-        """
-        B = len(self.first)
-        no_actions = self.first.new_zeros(B, 0, self.model.action_dim)
-        starts = self.first[:, None], no_actions, torch.ones(B, dtype=torch.long, device=self.first.device)
-        episodes = imagine(
-            self.model,
-            policy,
-            starts,
-            horizon=0,
-            tail=self.options.selection_steps,
-            terminated=self.terminated,
-            novelty_limit=self.options.novelty_limit,
-        )
-        return float(episodes.rewards.double().sum() / B)
+    table = []
+    for step, terminated, halted in steps:
+        p = step.prediction
+        taken = torch.ones_like(terminated)
+        row = (step.observation, step.action, p.reward, p.observation, terminated, halted)
+        row = (*row, p.aleatoric, p.uncertainty, taken)
+        whole = len(step.rows) == count
+        table.append(row if whole else tuple(_spread(column, step.rows, count) for column in row))
+    return Rollouts(*(torch.stack(columns) for columns in zip(*table, strict=True)))
 
 
-class _Deterministic:
-    """The same policy without its noise."""
-
-    def __init__(self, policy: Policy) -> None:
-        self.policy = policy
-
-    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
-        return self.policy.act(observation, True, generator)
-
-
-def _advance(
-    model: WorldModel,
-    policy: Policy,
-    state: Any,
-    branch: Tensor,
-    step: int,
-    terminated: Callable[[Tensor], Tensor],
-    novelty_limit: float | None,
-    mode: Mode,
-    generator: torch.Generator | None,
-) -> tuple[Rollouts, Any]:
-    """One step of all rollouts that are still alive."""
-    observation = model.current(state)
-    action = policy.act(observation, deterministic=False, generator=generator)
-    state, prediction = model.step(state, action, mode=mode, generator=generator)
-    fell = terminated(prediction.observation)
-    part = Rollouts(
-        observations=observation,
-        actions=action,
-        rewards=prediction.reward,
-        next_observations=prediction.observation,
-        terminated=fell,
-        halted=torch.zeros_like(fell) if novelty_limit is None else ~fell & (_novelty(prediction) > novelty_limit),
-        aleatoric=prediction.aleatoric,
-        uncertainty=prediction.uncertainty,
-        branch=branch,
-        step=torch.full_like(branch, step),
-    )
-    return part, state
+def _spread(column: Tensor, rows: Tensor, count: int) -> Tensor:
+    """Values (R, …) of some rows as (B, …), zeros elsewhere."""
+    return column.new_zeros(count, *column.shape[1:]).index_copy(0, rows, column)
 
 
 def _novelty(prediction: Prediction) -> Tensor:

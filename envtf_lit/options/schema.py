@@ -4,75 +4,86 @@ import dataclasses
 import math
 import types
 import typing
-from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple, Protocol, Union, get_args, get_origin, get_type_hints
+from collections.abc import Mapping
+from typing import Any, Literal, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from envtf_lit.errors import UserError, did_you_mean
 
 Precision = Literal["fp32", "bf16"]
+Options = TypeVar("Options")
 
 
-class Range(NamedTuple):
-    """A test of a number and the words for what passes it."""
-
-    passes: Callable[[float], bool]
-    words: str
-
-
-_FINITE = Range(math.isfinite, "finite")
-_COUNT = Range(lambda value: value >= 1, "1 or more")
-_NOT_NEGATIVE = Range(lambda value: value >= 0, "0 or more")
-_POSITIVE = Range(lambda value: value > 0, "more than 0")
-_SHARE = Range(lambda value: 0 <= value < 1, "in [0, 1)")
-_INNER_SHARE = Range(lambda value: 0 < value < 1, "in (0, 1)")
-_NONZERO_SHARE = Range(lambda value: 0 < value <= 1, "in (0, 1]")
-# by the option's name, wherever it stands; of a list, for each of its items
-RANGES: dict[str, Range] = {
-    **dict.fromkeys(("threads", "layers", "heads", "width", "context", "updates", "updates_per_epoch"), _COUNT),
-    **dict.fromkeys(("updates_per_step", "batch_size", "clone_updates", "clone_batch_size", "branches"), _COUNT),
-    **dict.fromkeys(("horizon", "buffer_size", "hidden", "critics", "sampled_actions", "episodes"), _COUNT),
-    **dict.fromkeys(("trajectories", "n_step", "selection_steps", "members", "elites", "patience"), _COUNT),
-    **dict.fromkeys(("rollouts", "share", "max_steps", "value_passes", "multi_step"), _COUNT),
-    **dict.fromkeys(
-        ("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty", "tail", "posterior"),
-        _NOT_NEGATIVE,
-    ),
-    **dict.fromkeys(
-        ("cql_weight", "clone_weight", "warm_start", "selection_episodes", "random_features"), _NOT_NEGATIVE
-    ),
-    **dict.fromkeys(("learning_rate", "actor_learning_rate", "critic_learning_rate", "value_learning_rate"), _POSITIVE),
-    **dict.fromkeys(
-        (
-            "warm_start_learning_rate",
-            "eps",
-            "gradient_clip",
-            "temperature",
-            "initial_alpha",
-            "return_temperature",
-            "novelty_limit",
-        ),
-        _POSITIVE,
-    ),
-    **dict.fromkeys(("dropout", "scheduled_sampling", "any_step", "warmup", "discount", "trace"), _SHARE),
-    "held_out": _INNER_SHARE,
-    **dict.fromkeys(("real_ratio", "target_rate", "actor_average"), _NONZERO_SHARE),
-    "transitions": Range(lambda value: value >= 1000, "1000 or more"),
-    "video_frames": Range(lambda value: 2 <= value <= 150, "from 2 to 150"),
-}
-
-
-def build_section(cls: type, values: Mapping[str, Any], section: str) -> Any:
-    """One options class from a tree of plain values, types and ranges checked.
+def build(cls: type[Options], values: Any, section: str) -> Options:
+    """One options class from a tree of plain values, types and ranges checked; what is absent takes its default.
 
     Args:
-        cls: of the options, such as `TrainModelOptions`.
-        values: by name; what is absent takes its default.
-        section: what errors call it, such as `train_model`.
+        cls: a dataclass of options, whose annotations name types and ranges (`options.numbers`).
+        values: by name.
+        section: what errors call it, such as `train_model.transformer`; empty for the top level.
 
     Raises:
-        UserError: an unknown option, or a value of the wrong type or out of range.
+        UserError: an unknown option (with the nearest known one), or a value of the wrong type or out of range.
     """
-    return build(cls, values, section)
+    hints = get_type_hints(cls)
+    if not isinstance(values, Mapping):
+        _refuse(section, values, f"a section with the keys {', '.join(hints)}")
+    for name in values:
+        if name not in hints:
+            where = f"in {section}" if section else "at the top level"
+            raise UserError(f"Unknown option {name!r} {where}: {did_you_mean(str(name), hints)}")
+    prefix = f"{section}." if section else ""
+    built = {name: _value(hints[name], item, prefix + name) for name, item in values.items()}
+    try:
+        return cls(**built)
+    except UserError as error:  # a rule of the class, which does not know its own place
+        raise UserError(f"{prefix}{error}") from None
+
+
+def build_tagged(classes: Mapping[str, type[Options]], tag: str, values: Any, section: str) -> Options:
+    """The options class that a key of the section names, from the rest of it.
+
+    Args:
+        classes: by the tag's value.
+        tag: the key, such as `algorithm`.
+        values: by name, the tag among them.
+        section: what errors call it, such as `train_policy.cql`.
+
+    Raises:
+        UserError: no such tag, an unknown one (with the nearest known one), or what `build` raises.
+    """
+    if not isinstance(values, Mapping):
+        _refuse(section, values, f"a section with the key {tag}")
+    if tag not in values:
+        raise UserError(f"{section} has no {tag}: {did_you_mean('', classes)}")
+    name = str(values[tag])
+    if name not in classes:
+        raise UserError(f"{section}.{tag} is {values[tag]!r}: {did_you_mean(name, classes)}")
+    return build(classes[name], {key: value for key, value in values.items() if key != tag}, section)
+
+
+def rebuild(options: Options) -> Options:
+    """The same options from plain numbers, checked: whatever put them together.
+
+    Raises:
+        UserError: one is of the wrong type or out of range.
+    """
+    return build(type(options), dataclasses.asdict(typing.cast(Any, options)), "")
+
+
+def options_class(hint: Any) -> type | None:
+    """The dataclass behind an annotation, looking through `X | None`, or None where it is a plain value."""
+    return next((x for x in (hint, *get_args(hint)) if dataclasses.is_dataclass(x) and isinstance(x, type)), None)
+
+
+def kind(hint: Any) -> str:
+    """An annotation in words: `int, 1 or more`, `relu | gelu`, `list of …`."""
+    if get_origin(hint) is Literal:
+        return " | ".join(get_args(hint))
+    if get_origin(hint) is tuple:
+        return f"list of {kind(get_args(hint)[0])}"
+    if get_origin(hint) in (Union, types.UnionType):
+        return " | ".join("null" if x is type(None) else kind(x) for x in get_args(hint))
+    return f"{_base(hint).__name__}, {_range(hint)}" if _is_number(hint) else hint.__name__
 
 
 def _refuse(key: str, value: Any, expected: str) -> typing.NoReturn:
@@ -80,51 +91,55 @@ def _refuse(key: str, value: Any, expected: str) -> typing.NoReturn:
     raise UserError(f"{key or 'The top level'} is {shown}, expected {expected}.")
 
 
-def build(cls: type, value: Any, key: str) -> Any:
-    if not isinstance(value, Mapping):
-        _refuse(key, value, f"a section with the keys {', '.join(field.name for field in dataclasses.fields(cls))}")
-    hints = get_type_hints(cls)
-    for name in value:
-        if name not in hints:
-            where = f"in {key}" if key else "at the top level"
-            raise UserError(f"Unknown option {name!r} {where}: {did_you_mean(str(name), hints)}")
-    prefix = f"{key}." if key else ""
-    return cls(**{name: _value(hints[name], item, prefix + name, name) for name, item in value.items()})
-
-
-def _value(hint: Any, value: Any, key: str, name: str) -> Any:
+def _value(hint: Any, value: Any, key: str) -> Any:
     origin, arguments = get_origin(hint), get_args(hint)
     if dataclasses.is_dataclass(hint):
         return build(typing.cast(type, hint), value, key)
     if origin in (Union, types.UnionType):  # `X | None` is the only union
-        return None if value is None else _value(arguments[0], value, key, name)
+        return None if value is None else _value(arguments[0], value, key)
     if origin is tuple:
         if not isinstance(value, list | tuple) or not value:
             _refuse(key, value, "a list such as [256, 256]")
-        return tuple(_value(arguments[0], item, key, name) for item in value)
+        return tuple(_value(arguments[0], item, key) for item in value)
     if origin is Literal:
         if value not in arguments:
             raise UserError(f"{key} is {value!r}: {did_you_mean(str(value), arguments)}")
         return value
-    return _number(hint, value, key, name) if hint in (int, float) else _plain(hint, value, key)
-
-
-def _plain(hint: type, value: Any, key: str) -> Any:
+    if _is_number(hint):
+        return _number(hint, value, key)
     if not isinstance(value, hint):
         _refuse(key, value, {bool: "true or false", str: "a text"}[hint])
     return value
 
 
-def _number(hint: type, value: Any, key: str, name: str) -> Any:
-    kind = "an integer" if hint is int else "a number"
-    limits = RANGES.get(name, _FINITE)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        _refuse(key, value, f"{kind}, {limits.words}")
-    if hint is int and value != int(value):  # 1e6 is a float to YAML and a fine count to everybody
-        _refuse(key, value, f"{kind}, {limits.words}")
-    if not limits.passes(value):
-        _refuse(key, value, f"{kind}, {limits.words}")
-    return hint(value)
+def _is_number(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, int | float) and hint is not bool
+
+
+def _base(hint: type) -> type:
+    return int if issubclass(hint, int) else float
+
+
+def _range(hint: type) -> str:
+    """In words: `1 or more`, `in [0, 1)`, or `finite` where there is none."""
+    bounds: list[tuple[Any, float]] = getattr(hint, "_restrictions", [])
+    signs = {test.__name__: bound for test, bound in bounds}
+    if len(bounds) == 2:
+        low, high = next(iter(bounds))[1], bounds[1][1]
+        return f"in {'[' if 'ge' in signs else '('}{low}, {high}{']' if 'le' in signs else ')'}"
+    if not bounds:
+        return "finite"
+    return f"{signs['ge']} or more" if "ge" in signs else f"more than {signs['gt']}"
+
+
+def _number(hint: type, value: Any, key: str) -> int | float:
+    base = _base(hint)
+    whole = isinstance(value, int | float) and math.isfinite(value) and not isinstance(value, bool)
+    if whole and base is int:
+        whole = value == int(value)  # 1e6 is a float to YAML and a fine count to everybody
+    if not whole or not all(test(value, bound) for test, bound in getattr(hint, "_restrictions", [])):
+        _refuse(key, value, f"{'an integer' if base is int else 'a number'}, {_range(hint)}")
+    return base(value)
 
 
 class Budget(Protocol):
@@ -137,7 +152,7 @@ class Budget(Protocol):
     def updates_per_epoch(self) -> int: ...
 
 
-def check_epochs(section: str, options: Budget) -> None:
+def check_epochs(options: Budget) -> None:
     """A training is whole epochs.
 
     Raises:
@@ -145,6 +160,5 @@ def check_epochs(section: str, options: Budget) -> None:
     """
     if options.updates % options.updates_per_epoch:
         raise UserError(
-            f"{section}.updates is {options.updates}: take a multiple of its updates_per_epoch "
-            f"({options.updates_per_epoch})."
+            f"updates is {options.updates}: take a multiple of its updates_per_epoch ({options.updates_per_epoch})."
         )

@@ -1,0 +1,44 @@
+"""COMBO's conservative term (Yu et al. 2021): down on real and imagined rows alike, up on real rows alone."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from torch import Tensor
+
+from envtf_lit.agents.cql import CQL, CQLOptions
+from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.imagination.options import RolloutOptions
+from envtf_lit.options.numbers import Natural, NonzeroShare
+
+
+@dataclass(frozen=True)
+class ImaginingOptions(CQLOptions):
+    """Options of policies that learn from imagined rows, too.
+
+    Attributes:
+        real_ratio: share of real rows in each batch, in (0, 1].
+        refresh_every: updates between two rounds of new rollouts under the current policy; 0 keeps the stored ones
+            (the paper's fixed buffer).
+        rollouts: the imagined rollouts.
+    """
+
+    real_ratio: NonzeroShare = 0.75
+    refresh_every: Natural = 250
+    rollouts: RolloutOptions = field(default_factory=RolloutOptions)
+
+
+
+class COMBO(CQL):
+    """Conservative Q-Learning on a mixture of real and imagined rows, in COMBO's form."""
+
+    Options: ClassVar[type[PolicyOptions]] = ImaginingOptions
+    label = "COMBO"
+    imagines = True
+    options: ImaginingOptions
+
+    def conservative_gap(self, q_data: Tensor, q_proposed: Tensor, log_density: Tensor, real: Tensor) -> Tensor:
+        """(n,) the soft maximum of Q over all rows, less Q of the real rows' actions (equation 3).
+
+        To push up on imagined rows, too, would reward the policy's own imagined actions.
+        """
+        return self.pushed_down(q_proposed, log_density).mean(1) - (q_data * real).sum(1) / real.sum()

@@ -1,0 +1,86 @@
+"""The Environment Transformer's policies: conservative Q-learning on the log and on imagined rollouts."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from envtf_lit.agents.agent import Losses, Part, Phase
+from envtf_lit.agents.combo import COMBO, ImaginingOptions
+from envtf_lit.agents.cql import CQL
+from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.value_gradient import (
+    BETAS,
+    LEARNING_RATE,
+    StateValues,
+    ValueGradient,
+    ValueGradientOptions,
+    ValueWarmStart,
+)
+from envtf_lit.errors import UserError
+
+
+class ETCQLPaper(CQL):
+    """The paper as written: both conservative terms on the mixture of real and imagined rows (equation 5)."""
+
+    Options: ClassVar[type[PolicyOptions]] = ImaginingOptions
+    label = "ET + CQL (paper)"
+    imagines = True
+    options: ImaginingOptions
+
+
+@dataclass(frozen=True)
+class ETCQLOptions(ImaginingOptions):
+    """Our own variant's options.
+
+    Attributes:
+        value_gradient: the end of the training, in which the actor follows the gradient through the world model; null
+            leaves all updates to CQL.
+    """
+
+    value_gradient: ValueGradientOptions | None = field(default_factory=ValueGradientOptions)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        gradient = self.value_gradient
+        if gradient is None:
+            return
+        if gradient.horizon < self.rollouts.history:
+            raise UserError(
+                f"value_gradient.horizon is {gradient.horizon} and rollouts.history is {self.rollouts.history}: "
+                "rollouts carried on take their history from the steps before, so take a horizon of at least that."
+            )
+        if gradient.updates > self.updates - self.warm_updates:
+            raise UserError(
+                f"value_gradient.updates is {gradient.updates}, and {self.updates - self.warm_updates} updates come "
+                "after the warm start: take no more than those."
+            )
+
+
+class ETCQL(COMBO):
+    """CQL in COMBO's form on data and fresh imagination, then the actor follows the gradient of imagined returns."""
+
+    Options: ClassVar[type[PolicyOptions]] = ETCQLOptions
+    label = "ET + CQL"
+    options: ETCQLOptions
+
+    def build_networks(self) -> None:
+        super().build_networks()
+        if self.options.value_gradient is not None:
+            self.values = StateValues(self.observation_dim)
+
+    def build_phases(self) -> list[Phase]:
+        o = self.options
+        if o.value_gradient is None:
+            return super().build_phases()
+        assert self.source is not None
+        warm, last = o.warm_updates, o.value_gradient.updates
+        losses = Losses(o.updates - warm - last, scheduled=o.updates - warm)
+        return [ValueWarmStart(warm), losses, ValueGradient(self.source.imagination, o.value_gradient)]
+
+    def parts(self) -> dict[str, Part]:
+        gradient = self.options.value_gradient
+        if gradient is None:
+            return super().parts()
+        return super().parts() | dict(
+            actor_by_gradient=Part(self.actor, gradient.learning_rate, BETAS),
+            value=Part(self.values.value, LEARNING_RATE),
+        )
