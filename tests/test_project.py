@@ -241,8 +241,8 @@ def test_tiny_pipeline_runs_once_and_an_experiment_reruns_only_its_part(tmp_path
         return result.stdout
 
     main(["init", str(tmp_path), "--preset", "tiny"])
-    (tmp_path / ".dvc/config.local").unlink()
     call("git", "init", "-q")
+    call("dvc", "config", "core.no_scm", "false")
     pipeline_before = (tmp_path / "dvc.yaml").read_text()
     call("dvc", "repro")
     metrics = json.loads((tmp_path / "reports/metrics.json").read_text())

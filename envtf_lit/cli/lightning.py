@@ -1,6 +1,8 @@
 """`envtf model …` and `envtf agent …`: LightningCLI over the classes that the pipeline trains."""
 
+import itertools
 import json
+import os
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -41,7 +43,8 @@ TRUST = (
     "--model.options.updates N, or --trainer.max_epochs N to leave the learning-rate schedule as it is. A model that "
     "starts from another (--model.init_from) has its architecture where no flag says otherwise. After fit, the weights "
     "of the last update, or of the best epoch where a ModelCheckpoint with a monitor says which that is, lie in the "
-    "folder `published`, whose path is printed. --config takes a file, or the name of one that comes along: "
+    "folder `published`, or `published_1`, …, beside an earlier run's; its path is printed. --config takes a file, or "
+    "the name of one that comes along: "
     f"{SHIPPED}."
 )
 
@@ -139,13 +142,17 @@ class LogTransitions(_Sourced, TransitionData):
 
 
 class Publish(Callback):
-    """Writes what was trained as a model folder, as the pipeline's stages do, beside the run's logs."""
+    """Writes what was trained as a model folder, as the pipeline's stages do, beside the run's logs.
+
+    What an earlier run published there stays, and a trial run, `fast_dev_run`, leaves nothing behind.
+    """
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         # by all processes: each may hold a part of the weights
-        state, folder = trainer.strategy.lightning_module_state_dict(), _folder(trainer) / "published"
-        if not trainer.is_global_zero:
+        state, place = trainer.strategy.lightning_module_state_dict(), _folder(trainer) / "published"
+        if trainer.fast_dev_run or not trainer.is_global_zero:  # pyright: ignore[reportAttributeAccessIssue]
             return
+        folder = _free(place)
         curves = _curves(trainer)
         weights, row = "last update", curves.rows[-1] if curves.rows else {}
         if isinstance(pl_module, LitEnsemble):
@@ -178,20 +185,26 @@ def _best(trainer: L.Trainer) -> ModelCheckpoint | None:
 
 
 class KeepConfig(SaveConfigCallback):
-    """Writes the whole configuration to `config.yaml` beside the run's logs, wherever the logger keeps them."""
+    """Writes the whole configuration to `config.yaml`, or `config_1.yaml`, …, beside the run's logs."""
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         self.folder = _folder(trainer)
         super().setup(trainer, pl_module, stage)
 
     def save_config(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        with replacing(self.folder / "config.yaml") as temporary:
+        with replacing(_free(self.folder / "config.yaml")) as temporary:
             self.parser.save(self.config, str(temporary), skip_none=False, multifile=False)
 
 
 def _folder(trainer: L.Trainer) -> Path:
     """The run's own folder; not every logger has one. To be asked by all processes: the first tells the others."""
     return Path(trainer.log_dir or trainer.default_root_dir)
+
+
+def _free(path: Path) -> Path:
+    """The path, or the first of `NAME_1`, `NAME_2`, … that is not there: without a logger, runs share a folder."""
+    numbered = (path.with_stem(f"{path.stem}_{number}") for number in itertools.count(1))
+    return next(free for free in itertools.chain([path], numbered) if not os.path.lexists(free))
 
 
 class _LinkedCLI(LightningCLI):
