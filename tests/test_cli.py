@@ -244,7 +244,7 @@ def test_lightnings_command_lines_refuse_bad_input_alike(project: Path) -> None:
 
 FULL_DISK = """
 import resource, sys
-from envtf_lit.lightning_cli import run
+from envtf_lit.cli.lightning import run
 from envtf_lit.cli import main
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (4_000, 4_000))  # every larger file fails as on a full disk

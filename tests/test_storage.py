@@ -131,7 +131,7 @@ import torch
 from envtf_lit.data.formats import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.policy import TanhGaussianActor, save_policy
-from envtf_lit.storage import write_json
+from envtf_lit.files import write_json
 from tests.walker import walker_dataset
 
 dataset, actor = walker_dataset(episodes=100), TanhGaussianActor(30, 20)

@@ -6,7 +6,6 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,20 +14,22 @@ import torch
 from jsonargparse import Namespace
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from rich.console import Console
 
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.options import PolicyOptions, check_no_imagination, check_policy
 from envtf_lit.agents.store import publish_policy
+from envtf_lit.cli.saved_options import checkpoint_options, model_architecture, policy_architecture
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import TransitionData, WindowData
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.data.sources.minari import read_minari
 from envtf_lit.errors import UserError
-from envtf_lit.files import read_json, replacing
+from envtf_lit.files import replacing
 from envtf_lit.options.schema import build_section
 from envtf_lit.pipeline.params import Params
-from envtf_lit.training import Curves
+from envtf_lit.training import Curves, WholeCheckpoints
 from envtf_lit.world_models.fit import publish_world_model
 from envtf_lit.world_models.lit import LitEnsemble, LitWorldModel, lit_world_model, window_options
 from envtf_lit.world_models.options import TrainModelOptions, check_world_model
@@ -213,6 +214,7 @@ class _LinkedCLI(LightningCLI):
     from_data: tuple[str, ...] = ("observation_dim", "action_dim")
     links: dict[str, str]
     options: type[TrainModelOptions] | type[PolicyOptions]
+    architecture: Callable[[str], dict[str, Any]]  # the options that a published folder's weights ask for
     verbs: tuple[str, ...]
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -239,9 +241,9 @@ class _LinkedCLI(LightningCLI):
             verb = self.config.subcommand
             checkpoint, base = self.config[verb].ckpt_path, self.config[verb].model.init_from
             if checkpoint is not None and not LIGHTNINGS_OWN.match(checkpoint):
-                below = _saved_options(checkpoint, self.options)
+                below = checkpoint_options(checkpoint, self.options)
             elif base is not None:
-                below = {"options": self.architecture(read_json(Path(base) / "config.json"))}
+                below = {"options": self.architecture(base)}
             else:
                 return
             begin = args.index(verb) + 1  # below flags: the first --config
@@ -252,12 +254,9 @@ class _LinkedCLI(LightningCLI):
         # only now: Lightning would take it for the callback that saves checkpoints, and make none;
         # at the front, so that checkpoints hold the row of their epoch
         trainer.callbacks.insert(0, Curves())  # pyright: ignore[reportAttributeAccessIssue]
+        if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:  # neither a strategy's own nor the user's
+            trainer.strategy.checkpoint_io = WholeCheckpoints()
         return trainer
-
-    @staticmethod
-    def architecture(config: dict[str, Any]) -> dict[str, Any]:
-        """The options that a published folder's weights ask for, given its config.json."""
-        raise NotImplementedError
 
     @staticmethod
     def check(options: Any) -> None:
@@ -287,13 +286,9 @@ class ModelCLI(_LinkedCLI):
     """`envtf model`."""
 
     options = TrainModelOptions
+    architecture = staticmethod(model_architecture)
     verbs = ("fit", "validate", "test")
     links = {"model.options.held_out": "data.held_out", "model.seed": "data.seed"}
-
-    @staticmethod
-    def architecture(config: dict[str, Any]) -> dict[str, Any]:
-        arguments = _arguments(config, ("observation_dim", "action_dim"))
-        return {"ensemble": arguments} if config.get("kind") == "ensemble_dynamics" else {"model": arguments}
 
     @staticmethod
     def check(options: TrainModelOptions) -> None:
@@ -308,6 +303,7 @@ class AgentCLI(_LinkedCLI):
     """`envtf agent`."""
 
     options = PolicyOptions
+    architecture = staticmethod(policy_architecture)
     verbs = ("fit", "validate")
     from_data = ("observation_dim", "action_dim", "action_low", "action_high")
     links = {
@@ -318,10 +314,6 @@ class AgentCLI(_LinkedCLI):
         "model.options.return_temperature": "data.return_temperature",
         "model.seed": "data.seed",
     }
-
-    @staticmethod
-    def architecture(config: dict[str, Any]) -> dict[str, Any]:
-        return {name: value for name, value in _arguments(config).items() if name == "hidden"}
 
     @staticmethod
     def check(options: PolicyOptions) -> None:
@@ -347,31 +339,6 @@ def _plain(options: Namespace) -> dict[str, Any]:
     """The options as nested dictionaries, whatever jsonargparse wraps around optional dataclasses."""
     values = {name: _plain(value) if isinstance(value, Namespace) else value for name, value in vars(options).items()}
     return values.get("init_args", values)
-
-
-def _saved_options(checkpoint: str, kind: type[TrainModelOptions] | type[PolicyOptions]) -> dict[str, Any]:
-    """The options, of this kind, and the seed that a Lightning checkpoint was trained with.
-
-    Raises:
-        UserError: the file is missing or is not such a checkpoint.
-    """
-    try:
-        saved = torch.load(checkpoint, map_location="cpu", weights_only=True)["hyper_parameters"]
-        if not saved["options"].keys() <= {field.name for field in fields(kind)}:
-            raise KeyError
-        return {name: saved[name] for name in ("options", "seed", "freeze")}
-    except FileNotFoundError:
-        raise UserError(f"{checkpoint} does not exist: give --ckpt_path a checkpoint of an earlier fit.") from None
-    except Exception:  # whatever unpickling raises; torch's own message recommends to run code found in the file
-        raise UserError(
-            f"{checkpoint} is not a checkpoint of this model: give --ckpt_path a file that fit wrote."
-        ) from None
-
-
-def _arguments(config: dict[str, Any], without: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The constructor's arguments in a published folder's config.json; an odd file is for the loader to refuse."""
-    arguments = config.get("arguments") if isinstance(config, dict) else None
-    return {name: value for name, value in (arguments or {}).items() if name not in without}
 
 
 def _shipped_configs(arguments: list[str]) -> Iterator[str]:

@@ -204,8 +204,8 @@ def build_suite(
     # a record that is older than this key is judged by the dataset's card
     older = {"origin": {name: read_json(card).get(name) for name in key["origin"]}} if card.exists() else {}
     suite = Suite(task, get_task(task).robot, options, home / DATASET, {}, {}, {})
-    download = partial(download, shared, home, progress=progress)
-    _unless_done(home / "data.json", suite.dataset, key, download, older)
+    collect = partial(download, shared, home, progress=progress)
+    _unless_done(home / "data.json", suite.dataset, key, collect, older)
     for name in models:
         add_model(suite, name, params[name].train_model, progress=progress)
     return suite
