@@ -58,7 +58,13 @@ GAPS = {
         "world_models.lit.LitWorldModel.fit_uncertainty",
     ),
     "clone": ("generate_rollouts", TINY, "models/behaviour", {"last.ckpt"}, "pipeline.generate_rollouts.replacing"),
-    "rollouts": ("generate_rollouts", TINY, "models/behaviour", {"last.ckpt"}, "pipeline.generate_rollouts.save_rollouts"),
+    "rollouts": (
+        "generate_rollouts",
+        TINY,
+        "models/behaviour",
+        {"last.ckpt"},
+        "pipeline.generate_rollouts.save_rollouts",
+    ),
     "policy": (
         "train_policy",
         replace(TINY, train_policy=replace(TINY.train_policy, et_cql=SELECTED)),

@@ -128,7 +128,7 @@ FULL_DISK = """
 import os, resource
 from pathlib import Path
 import torch
-from envtf_lit.data.formats import save_dataset
+from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.policy import TanhGaussianActor, save_policy
 from envtf_lit.files import write_json

@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -349,7 +350,9 @@ def _init(namespace: argparse.Namespace, rest: list[str]) -> None:
     kept, console = write_project(namespace.folder, namespace.preset), Console(highlight=False, soft_wrap=True)
     if kept:
         console.print(f"Left as they were: {', '.join(kept)}", markup=False)
-    console.print(f"Wrote a project to {namespace.folder}. Next: cd {namespace.folder} && dvc repro", markup=False)
+    first = "" if find_spec("dvc") else "pip install 'envtf-lit[pipeline]' && "
+    following = f"Next: {first}cd {namespace.folder} && dvc repro"
+    console.print(f"Wrote a project to {namespace.folder}. {following}", markup=False)
 
 
 def _params(namespace: argparse.Namespace, rest: list[str]) -> None:
