@@ -20,13 +20,13 @@ from envtf_lit.cli.main import main
 from envtf_lit.errors import UserError
 from envtf_lit.pipeline.report import report
 from envtf_lit.pipeline.yaml import preset_params
-from envtf_lit.project.doctor import report
+from envtf_lit.project.doctor import report as doctor_report
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 # modules that need more than the library's own dependencies
-NEED = {"envtf_lit/figures/notebook.py": "pipeline", "envtf_lit/behaviour_training.py": "behaviour"}
+NEED = {"envtf_lit/figures/notebook.py": "pipeline", "envtf_lit/zoo/train.py": "behaviour"}
 IMPORTED_AS = {"pillow": "PIL", "ipython": "IPython", "ruamel.yaml": "ruamel", "sbx-rl": "sbx"}
 NOT_IMPORTED = {
     "dvc": "runs dvc.yaml",
@@ -177,7 +177,8 @@ WITHOUT_EXTRAS = """
 import sys
 for name in "dvc dvclive IPython ipykernel jinja2 jupyter_client nbconvert nbformat papermill sbx tensorboard".split():
     sys.modules[name] = None
-import envtf_lit.pipeline.evaluate, envtf_lit.pipeline.train_policy, envtf_lit.cli.lightning, envtf_lit.zoo.build, envtf_lit.studies.horizon
+import envtf_lit.pipeline.evaluate, envtf_lit.pipeline.train_policy, envtf_lit.cli.lightning
+import envtf_lit.zoo.build, envtf_lit.studies.horizon
 print(envtf_lit.load_dataset, envtf_lit.load_policy, envtf_lit.load_world_model)
 """
 
@@ -209,12 +210,12 @@ def test_doctor_finds_a_mujoco_torn_by_its_upgrade(tmp_path: Path, monkeypatch: 
     torn = TornMujoco(tmp_path, "__init__.py", "_specs.so", "__init__.cpython-311.pyc")
     monkeypatch.setattr("envtf_lit.project.doctor.distribution", lambda name: torn)
     monkeypatch.setattr("envtf_lit.project.doctor._rendering", lambda: "not asked")
-    said = report()["mujoco"]
+    said = doctor_report()["mujoco"]
     assert said.startswith("4.0.0, broken: 1 files of mujoco-core are missing")
     cure = "pip install --force-reinstall --no-deps mujoco==4.0.0 mujoco-core==4.0.0 mujoco-studio==4.0.0"
     assert said.endswith(cure)
     (tmp_path / "_specs.so").touch()
-    assert report()["mujoco"] == version("mujoco")
+    assert doctor_report()["mujoco"] == version("mujoco")
 
 
 # the package's own face

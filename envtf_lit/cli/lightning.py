@@ -34,7 +34,7 @@ from envtf_lit.world_models.fit import publish_world_model
 from envtf_lit.world_models.lit import LitEnsemble, LitWorldModel, lit_world_model, window_options
 from envtf_lit.world_models.options import TrainModelOptions, check_world_model
 
-CONFIGS = Path(__file__).parent / "configs"
+CONFIGS = Path(__file__).parent.parent / "configs"
 SHIPPED = ", ".join(sorted(path.stem for path in CONFIGS.glob("*.yaml")))
 
 TRUST = (
