@@ -134,12 +134,19 @@ def _range(hint: type) -> str:
 
 def _number(hint: type, value: Any, key: str) -> int | float:
     base = _base(hint)
-    whole = isinstance(value, int | float) and math.isfinite(value) and not isinstance(value, bool)
+    whole = isinstance(value, int | float) and not isinstance(value, bool) and _is_finite(value)
     if whole and base is int:
         whole = value == int(value)  # 1e6 is a float to YAML and a fine count to everybody
     if not whole or not all(test(value, bound) for test, bound in getattr(hint, "_restrictions", [])):
         _refuse(key, value, f"{'an integer' if base is int else 'a number'}, {_range(hint)}")
     return base(value)
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond all floats
+        return False
 
 
 class Budget(Protocol):
