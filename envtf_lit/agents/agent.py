@@ -168,6 +168,16 @@ class Agent(L.LightningModule, ABC):
     def losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
         """(part, loss, what to log), in the order in which they descend; each is computed after the one before did."""
 
+    def warm_start_losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
+        """As `losses`, before them: what the log alone teaches. An actor that began from another does not clone it."""
+        if self.clones:
+            loss = self.clone_loss(batch)
+            yield "actor", loss, dict(clone_loss=loss)
+
+    def end_warm_start(self) -> None:
+        """What follows slowly catches up."""
+        self.average_actor.load_state_dict(self.actor.state_dict())
+
     def rate(self, part: str, progress: float) -> float:
         """A part's learning rate after this share of the `Losses` phase."""
         return self.parts()[part].learning_rate

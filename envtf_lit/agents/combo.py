@@ -22,6 +22,8 @@ class ImaginingOptions(CQLOptions):
         rollouts: the imagined rollouts.
     """
 
+    world_model: str = "transformer"
+
     real_ratio: NonzeroShare = 0.75
     refresh_every: Natural = 250
     rollouts: RolloutOptions = field(default_factory=RolloutOptions)

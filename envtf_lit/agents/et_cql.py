@@ -1,9 +1,12 @@
 """The Environment Transformer's policies: conservative Q-learning on the log and on imagined rollouts."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from envtf_lit.agents.agent import Losses, Part, Phase
+from torch import Tensor
+
+from envtf_lit.agents.agent import Batch, Logs, Losses, Part, Phase
 from envtf_lit.agents.combo import COMBO, ImaginingOptions
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.options import PolicyOptions
@@ -13,18 +16,33 @@ from envtf_lit.agents.value_gradient import (
     StateValues,
     ValueGradient,
     ValueGradientOptions,
-    ValueWarmStart,
 )
+from envtf_lit.agents.warm_start import WarmStart
 from envtf_lit.errors import UserError
+from envtf_lit.imagination.options import RolloutOptions
+from envtf_lit.options.numbers import Natural, NonzeroShare
+
+
+@dataclass(frozen=True)
+class ETCQLPaperOptions(ImaginingOptions):
+    """The paper's settings: a fixed buffer of one-step transitions, made by `generate_rollouts`, half of each batch."""
+
+    real_ratio: NonzeroShare = 0.5
+    refresh_every: Natural = 0
+    rollouts: RolloutOptions = field(
+        default_factory=lambda: RolloutOptions(
+            horizon=5, value_expansion=0, multi_step=False, posterior=0.0, novelty_limit=None
+        )
+    )
 
 
 class ETCQLPaper(CQL):
     """The paper as written: both conservative terms on the mixture of real and imagined rows (equation 5)."""
 
-    Options: ClassVar[type[PolicyOptions]] = ImaginingOptions
+    Options: ClassVar[type[PolicyOptions]] = ETCQLPaperOptions
     label = "ET + CQL (paper)"
     imagines = True
-    options: ImaginingOptions
+    options: ETCQLPaperOptions
 
 
 @dataclass(frozen=True)
@@ -74,7 +92,7 @@ class ETCQL(COMBO):
         assert self.source is not None
         warm, last = o.warm_updates, o.value_gradient.updates
         losses = Losses(o.updates - warm - last, scheduled=o.updates - warm)
-        return [ValueWarmStart(warm), losses, ValueGradient(self.source.imagination, o.value_gradient)]
+        return [WarmStart(warm), losses, ValueGradient(self.source.imagination, self.values, o.value_gradient)]
 
     def parts(self) -> dict[str, Part]:
         gradient = self.options.value_gradient
@@ -84,3 +102,14 @@ class ETCQL(COMBO):
             actor_by_gradient=Part(self.actor, gradient.learning_rate, BETAS),
             value=Part(self.values.value, LEARNING_RATE),
         )
+
+    def warm_start_losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
+        """Beside critics and actor, the state value of the value gradient learns the log's returns."""
+        yield from super().warm_start_losses(batch)
+        if self.options.value_gradient is not None:
+            yield "value", self.values.value_loss(batch["observations"], batch["returns"]), {}
+
+    def end_warm_start(self) -> None:
+        super().end_warm_start()
+        if self.options.value_gradient is not None:
+            self.values.target_value.load_state_dict(self.values.value.state_dict())

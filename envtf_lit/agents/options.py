@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from envtf_lit.data.loaders import UPDATES_PER_STEP
+from envtf_lit.errors import UserError
 from envtf_lit.options.numbers import Count, Natural, NonzeroShare, Positive, Share
 from envtf_lit.options.schema import check_epochs
 
@@ -52,6 +54,8 @@ class CommonOptions:
 
     def __post_init__(self) -> None:
         check_epochs(self)
+        if self.updates_per_epoch % UPDATES_PER_STEP:
+            raise UserError(f"updates_per_epoch is {self.updates_per_epoch}: take a multiple of {UPDATES_PER_STEP}.")
 
     @property
     def warm_updates(self) -> int:

@@ -124,11 +124,16 @@ class SAC(Agent):
         follow(self.target_critics, self.critics, self.options.target_rate)
         super().update_targets()
 
-    def value_loss(self, batch: Batch) -> tuple[Tensor, Logs]:
-        """Of the warm start: critics regress on Monte-Carlo returns of the log."""
+    def warm_start_losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
+        """Critics regress on Monte-Carlo returns of the log; the actor clones it."""
         q = self.critics(batch["observations"], batch["actions"])
         loss = 0.5 * (q - batch["returns"]).square().mean(1).sum()
-        return loss, dict(warm_critic_loss=loss, q_data=q.mean())
+        yield "critics", loss, dict(warm_critic_loss=loss, q_data=q.mean())
+        yield from super().warm_start_losses(batch)
+
+    def end_warm_start(self) -> None:
+        self.target_critics.load_state_dict(self.critics.state_dict())
+        super().end_warm_start()
 
     def validation_logs(self, batch: Batch) -> Logs:
         q = self.return_scale * self.critics(batch["observations"], batch["actions"]).min(0).values

@@ -1,11 +1,8 @@
 """Policy improvement by the gradient of imagined returns, which runs through the world model step by step."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -13,16 +10,12 @@ from torch import Tensor, nn
 from envtf_lit.agents.agent import Agent, Batch, Logs, Phase, follow
 from envtf_lit.agents.networks import StateValue
 from envtf_lit.agents.sac import held_fixed
-from envtf_lit.agents.warm_start import WarmStart
 from envtf_lit.imagination.buffer import Imagination
 from envtf_lit.imagination.histories import Histories
 from envtf_lit.imagination.rollouts import Rollouts, gather_steps
 from envtf_lit.options.numbers import Count, NonNegative, NonzeroShare, Positive
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.world_models.unroll import Step, unroll
-
-if TYPE_CHECKING:
-    from envtf_lit.agents.et_cql import ETCQL
 
 HIDDEN = (256, 256)  # units of the state value
 LEARNING_RATE = 0.001  # of the state value
@@ -166,30 +159,20 @@ class ImaginedPaths:
         )
 
 
-class ValueWarmStart(WarmStart):
-    """A warm start in which a state value learns the log's returns, too."""
-
-    def update(self, agent: Agent, batch: Batch, done: int) -> Logs:
-        logs = super().update(agent, batch, done)
-        et_cql: ETCQL = agent  # pyright: ignore[reportAssignmentType]
-        agent.descend("value", et_cql.values.value_loss(batch["observations"], batch["returns"]))
-        if done == self.updates - 1:
-            et_cql.values.target_value.load_state_dict(et_cql.values.value.state_dict())
-        return logs
-
-
 class ValueGradient(Phase):
     """The actor follows the gradient of imagined returns, kept near the real rows' actions (SVG, Heess et al. 2015).
 
-    A state value, learned on those very paths, stands for what follows a path (SHAC, Xu et al. 2022).
+    A state value, learned on those very paths, stands for what follows a path (SHAC, Xu et al. 2022). The agent's
+    parts are `actor_by_gradient` and `value`.
 
     Args:
         imagination: the world model and where rollouts begin.
+        values: the state value.
         options: of the paths and of the optimisation.
     """
 
-    def __init__(self, imagination: Imagination, options: ValueGradientOptions) -> None:
-        self.options, self.updates = options, options.updates
+    def __init__(self, imagination: Imagination, values: StateValues, options: ValueGradientOptions) -> None:
+        self.options, self.updates, self.values = options, options.updates, values
         self.paths = ImaginedPaths(imagination, options)
 
     def begin_epoch(self, agent: Agent) -> None:
@@ -198,18 +181,17 @@ class ValueGradient(Phase):
 
     def update(self, agent: Agent, batch: Batch, done: int) -> Logs:
         """One update of the actor, beginning at the averaged one; the state value then learns from the same paths."""
-        et_cql: ETCQL = agent  # pyright: ignore[reportAssignmentType]
         if done == 0:
             agent.actor.load_state_dict(agent.average_actor.state_dict())
         with torch.autocast(agent.device.type, enabled=False):  # errors of bf16 would add up along the path
-            logs = self.value_gradient_step(et_cql, batch, done)
-        follow(et_cql.values.target_value, et_cql.values.value, TARGET_RATE)
+            logs = self.value_gradient_step(agent, batch, done)
+        follow(self.values.target_value, self.values.value, TARGET_RATE)
         follow(agent.average_actor, agent.actor, self.options.actor_average)
         return logs
 
-    def value_gradient_step(self, agent: ETCQL, batch: Batch, done: int) -> Logs:
+    def value_gradient_step(self, agent: Agent, batch: Batch, done: int) -> Logs:
         """One step of the actor along the gradient, and several of the state value."""
-        values, discount = agent.values, agent.options.discount
+        values, discount = self.values, agent.options.discount
         paths = self.paths.next(agent.actor, agent.return_scale, agent.generator)
         with held_fixed(values.value):
             imagined = values.imagined_return(paths, discount).mean()

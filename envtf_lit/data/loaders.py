@@ -18,6 +18,8 @@ from envtf_lit.data.columns import Column, FileRows, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.sources.files import load_dataset
 
+UPDATES_PER_STEP = 10  # gradient steps of an agent per Lightning training step: no host synchronisation between them
+
 
 def epoch_generator(seed: int, epoch: int, stream: str, device: torch.device | str = "cpu") -> torch.Generator:
     """An independent random stream for each (seed, epoch, purpose), of numbers drawn on that device."""
@@ -325,7 +327,6 @@ class TransitionData(L.LightningDataModule):
     Args:
         path: dataset file, HDF5 or NPZ.
         batch_size: rows per gradient step and process.
-        updates_per_step: gradient steps per Lightning training step; a batch has shape (updates_per_step, batch_size).
         steps_per_epoch: Lightning training steps per epoch.
         discount: of future rewards, per step.
         n_step: steps whose rewards enter the temporal-difference target.
@@ -338,7 +339,6 @@ class TransitionData(L.LightningDataModule):
         self,
         path: str,
         batch_size: int = 256,
-        updates_per_step: int = 10,
         steps_per_epoch: int = 50,
         discount: float = 0.99,
         n_step: int = 1,
@@ -347,7 +347,7 @@ class TransitionData(L.LightningDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.batch_size, self.updates_per_step, self.steps_per_epoch = batch_size, updates_per_step, steps_per_epoch
+        self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
         self.discount, self.n_step, self.seed = discount, n_step, seed
         self.return_temperature = return_temperature
         whole = self.read(path)
@@ -365,8 +365,8 @@ class TransitionData(L.LightningDataModule):
         return Transitions(self.dataset, discount=self.discount, n_step=self.n_step, device=_device(self))
 
     def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """Batches (updates_per_step, batch_size, …) of `Transitions`."""
-        shape = (self.updates_per_step, self.batch_size)
+        """Batches (UPDATES_PER_STEP, batch_size, …) of `Transitions`."""
+        shape = (UPDATES_PER_STEP, self.batch_size)
         temperature = self.return_temperature
         weights = None if temperature is None else return_weights(self.dataset, temperature)
         rows, process = len(self.transitions), _process(self)

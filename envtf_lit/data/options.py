@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from envtf_lit.errors import UserError
+from envtf_lit.options.numbers import InnerShare, Rows
 
 
 @dataclass(frozen=True)
@@ -16,12 +17,14 @@ class DownloadOptions:
         path: the HDF5 or NPZ file of `source: file`; of `source: d4rl` a copy of its file, null downloads it.
         minari_id: of `source: minari`, such as `mujoco/hopper/medium-v0`, or its folder.
         transitions: rows to collect from the zoo.
+        held_out: share of the episodes that world models, and without a simulator policies, are not trained on.
     """
 
     source: Literal["zoo", "file", "d4rl", "minari"] = "zoo"
     path: str | None = None
     minari_id: str | None = None
-    transitions: int = 100_000
+    transitions: Rows = 100_000
+    held_out: InnerShare = 0.1
 
 
 def check_download(options: DownloadOptions, *, named: bool) -> None:

@@ -9,7 +9,7 @@ from envtf_lit.data.cards import UNSCORED, counted_episodes, dataset_scores
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.calibration import coverage
 from envtf_lit.evaluation.horizon import HorizonReport
-from envtf_lit.evaluation.offline import Promises
+from envtf_lit.evaluation.offline import OfflineEstimates
 from envtf_lit.robots.returns import Returns
 from envtf_lit.robots.tasks import Robot
 from envtf_lit.world_models.forecast import Scale
@@ -49,92 +49,71 @@ def world_model_metrics(report: HorizonReport, scale: Scale, *, parameters: int)
 
 
 def collect_metrics(
-    returns: Mapping[str, Returns],
-    *,
-    task: str,
-    seed: int,
-    dataset: OfflineDataset,
-    source: str,
-    robot: Robot,
-    world_model: Mapping[str, Any],
-    rollouts: int,
+    returns: Mapping[str, Returns], *, task: str, seed: int, dataset: OfflineDataset, source: str, robot: Robot,
+    labels: Mapping[str, str], **facts: Any
 ) -> dict[str, Any]:
     """What `reports/metrics.json` holds; standard deviations are over episodes, with n in the denominator.
 
     Args:
-        returns: episodes of `bc`, `cql` and `et_cql`.
+        returns: episodes of each policy, by name.
         task: name of the task.
         seed: of the experiment.
         dataset: the whole of it, held-out episodes included.
         source: of the dataset, as in `DownloadOptions`; there are no scores where it is Minari.
         robot: gives the scores their scale.
-        world_model: of `world_model_metrics`.
-        rollouts: imagined transitions stored by `generate_rollouts`.
+        labels: what to call each policy.
+        facts: what else stands there: `world_model` and `rollouts`.
     """
     unit, episodes = comparable(dataset, returns, robot, source)
-    recorded, policy = episodes["data"], returns["et_cql"]
-    found = {name: _spread(unit, episodes[name]) for name in returns}
-    return {
-        "task": task,
-        "seed": seed,
-        "dataset": {
-            "transitions": len(dataset),
-            "episodes": len(dataset.episode_starts),
-            f"{unit}_mean": float(recorded.mean()),
-            f"{unit}_max": float(recorded.max()),
-        },
-        "world_model": dict(world_model),
-        "rollouts": {"transitions": rollouts},
-        "policy": {
-            **found.pop("et_cql"),
-            **_spread("return", policy.returns),
-            "episodes": len(policy.returns),
-        },
-        "baselines": found,
+    recorded = episodes["data"]
+    policies = {
+        name: {"label": labels[name]} | _spread(unit, episodes[name]) | _spread("return", found.returns) | {"episodes": len(found.returns)}
+        for name, found in returns.items()
     }
+    known = {f"{unit}_mean": float(recorded.mean()), f"{unit}_max": float(recorded.max())}
+    return {"task": task, "seed": seed, "dataset": _size(dataset) | known, **facts, "policies": policies}
+
+
+def _size(dataset: OfflineDataset) -> dict[str, int]:
+    return {"transitions": len(dataset), "episodes": len(dataset.episode_starts)}
 
 
 def _spread(unit: str, values: np.ndarray) -> dict[str, float]:
     return {f"{unit}_mean": float(values.mean()), f"{unit}_std": float(values.std())}
 
 
-def collect_promises(
-    promises: Promises, *, seed: int, dataset: OfflineDataset, world_model: Mapping[str, Any], rollouts: int
+def collect_offline_metrics(
+    estimates: OfflineEstimates, *, seed: int, dataset: OfflineDataset, labels: Mapping[str, str], **facts: Any
 ) -> dict[str, Any]:
     """What `reports/metrics.json` holds for a robot without a simulator: no score, and no return that anyone measured.
 
     Args:
-        promises: of `bc`, `cql` and `et_cql`.
+        estimates: of each policy.
         seed: of the experiment.
         dataset: the whole of it, held-out episodes included.
-        world_model: of `world_model_metrics`.
-        rollouts: imagined transitions stored by `generate_rollouts`.
+        labels: what to call each policy.
+        facts: what else stands there: `world_model` and `rollouts`.
     """
     policies = {
-        name: {
-            "imagined_return_mean": float(promise.returns.mean()),
-            "imagined_return_std": float(promise.returns.std()),
-            "action_error": promise.action_error,
-        }
-        for name, promise in promises.policies.items()
+        name: {"label": labels[name]}
+        | _spread("imagined_return", estimate.returns)
+        | {"action_error": estimate.action_error}
+        for name, estimate in estimates.policies.items()
     }
+    error = np.sqrt(np.square(estimates.imagined - estimates.recorded).mean())
+    held_out = {
+        "episodes": len(estimates.recorded),
+        "return_mean": float(estimates.recorded.mean()),
+        "imagined_return_mean": float(estimates.imagined.mean()),
+        "imagined_return_error": float(error),
+    }
+    returns = dataset.episode_returns
+    known = {"return_mean": float(returns.mean()), "return_max": float(returns.max())}
     return {
         "task": None,
         "seed": seed,
-        "dataset": {
-            "transitions": len(dataset),
-            "episodes": len(dataset.episode_starts),
-            "return_mean": float(dataset.episode_returns.mean()),
-            "return_max": float(dataset.episode_returns.max()),
-        },
-        "world_model": dict(world_model),
-        "rollouts": {"transitions": rollouts},
-        "held_out": {
-            "episodes": len(promises.recorded),
-            "return_mean": float(promises.recorded.mean()),
-            "imagined_return_mean": float(promises.promised.mean()),
-            "imagined_return_error": float(np.sqrt(np.square(promises.promised - promises.recorded).mean())),
-        },
-        "policy": policies.pop("et_cql"),
-        "baselines": policies,
+        "dataset": _size(dataset) | known,
+        **facts,
+        "held_out": held_out,
+        "policies": policies,
     }

@@ -17,12 +17,13 @@ from envtf_lit.evaluation.horizon import HorizonReport
 from envtf_lit.policy import Policy
 from envtf_lit.world_models.forecast import Trajectories
 from envtf_lit.world_models.interface import WorldModel
+from envtf_lit.world_models.unroll import unroll
 
 LIVE = 1e-6  # an action dimension that varies less has no choice to agree about
 
 
 @dataclass(frozen=True, eq=False)
-class Promise:
+class OfflineEstimate:
     """What is known of one policy without its environment.
 
     Attributes:
@@ -37,23 +38,23 @@ class Promise:
 
 
 @dataclass(frozen=True, eq=False)
-class Promises:
+class OfflineEstimates:
     """What is known of policies without their environment.
 
     Attributes:
         recorded: (E,) float64, true returns of the held-out episodes.
-        promised: (E,) float64, what the model, on its own predictions, makes of the same actions.
+        imagined: (E,) float64, what the model, on its own predictions, makes of the same actions.
         policies: by name.
     """
 
     recorded: np.ndarray
-    promised: np.ndarray
-    policies: dict[str, Promise]
+    imagined: np.ndarray
+    policies: dict[str, OfflineEstimate]
 
 
-def judge(
+def evaluate_offline(
     model: WorldModel, policies: Mapping[str, Policy], report: HorizonReport, training: OfflineDataset
-) -> Promises:
+) -> OfflineEstimates:
     """The policies in the world model, and beside the log.
 
     Args:
@@ -63,12 +64,12 @@ def judge(
         training: gives the range of rewards and the spread of actions.
     """
     held_out = report.trajectories
-    promised = (_bounded(report.imagined.mean[..., -1], training) * held_out.valid).sum(1)
-    return Promises(
+    imagined = (_bounded(report.imagined.mean[..., -1], training) * held_out.valid).sum(1)
+    return OfflineEstimates(
         recorded=held_out.targets[..., -1].double().sum(1).cpu().numpy(),
-        promised=promised.cpu().numpy(),
+        imagined=imagined.cpu().numpy(),
         policies={
-            name: Promise(imagined_returns(model, policy, held_out, training), action_error(policy, held_out, training))
+            name: OfflineEstimate(imagined_returns(model, policy, held_out, training), action_error(policy, held_out, training))
             for name, policy in policies.items()
         },
     )
@@ -84,10 +85,9 @@ def imagined_returns(model: WorldModel, policy: Policy, held_out: Trajectories, 
     first, no_actions = held_out.observations[:, :1], held_out.actions[:, :0]
     state = model.init(first, no_actions, torch.ones_like(held_out.lengths))
     total = torch.zeros(len(first), dtype=torch.float64, device=first.device)
-    for running in held_out.valid.T:  # (B,) who is still recorded at this step
-        action = policy.act(model.current(state), True)
-        state, prediction = model.step(state, action, mode="mean")
-        total += torch.where(running, _bounded(prediction.reward, training), 0.0)
+    for step in unroll(model, state, lambda t, rows, observation: policy.act(observation, True), held_out.valid.shape[1]):
+        recorded = held_out.valid[:, step.index]  # (B,) whose episode still lasted
+        total += torch.where(recorded, _bounded(step.prediction.reward, training), 0.0)
     return total.cpu().numpy()
 
 
@@ -97,7 +97,7 @@ def _bounded(rewards: Tensor, training: OfflineDataset) -> Tensor:
 
 
 def action_error(policy: Policy, held_out: Trajectories, training: OfflineDataset) -> float:
-    """See `Promise.action_error`; zero where no action dimension varies."""
+    """See `OfflineEstimate.action_error`; zero where no action dimension varies."""
     _, spread = moments(torch.as_tensor(training.actions[rows]) for rows in column_blocks(training.actions))
     live = spread > LIVE
     chosen = policy.act(held_out.observations[held_out.valid], True).cpu().double()

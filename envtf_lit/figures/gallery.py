@@ -3,16 +3,16 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from envtf_lit.data.cards import counted_episodes
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.horizon import HorizonReport
 from envtf_lit.evaluation.metrics import comparable
-from envtf_lit.evaluation.offline import Promises
+from envtf_lit.evaluation.offline import OfflineEstimates
 from envtf_lit.figures import learning, model, scores
 from envtf_lit.figures.style import write_table
+from envtf_lit.imagination.rollouts import Rollouts
 from envtf_lit.robots.returns import Returns
 from envtf_lit.robots.tasks import Robot
 from envtf_lit.world_models.forecast import Scale
@@ -40,45 +40,50 @@ def draw_world_model(
     write_table(folder / "horizon_steps.csv", model.horizon_table(report))
 
 
-def draw_rollouts(step: np.ndarray, uncertainty: np.ndarray, folder: Path) -> None:
-    """`rollout_uncertainty`, from the stored rollouts' columns (M,)."""
+def draw_rollouts(rollouts: Rollouts, folder: Path) -> None:
+    """`rollout_uncertainty`, of the stored rollouts."""
+    step = rollouts.valid.nonzero()[:, 0].numpy()
+    uncertainty = rollouts.uncertainty[rollouts.valid].numpy()
     model.rollout_uncertainty(step, uncertainty, folder / "rollout_uncertainty.png")
 
 
-def draw_policies(
+def draw_policy_curves(curves: Mapping[str, pd.DataFrame], labels: Mapping[str, str], folder: Path) -> None:
+    """`policy_curves`, from the curves.csv of each policy."""
+    learning.learning_curves(curves, folder / "policy_curves.png", title="Policies, in training", labels=labels)
+
+
+def draw_scores(
     dataset: OfflineDataset,
     source: str,
     robot: Robot,
     returns: Mapping[str, Returns],
-    curves: Mapping[str, pd.DataFrame],
+    labels: Mapping[str, str],
     folder: Path,
 ) -> None:
-    """`scores` and `policy_curves`.
+    """`scores`, of every episode.
 
     Args:
         dataset: its episodes stand first.
         source: of the dataset, as in `DownloadOptions`; Minari's has no scores, and returns stand in their place.
         robot: gives the scores their scale.
-        returns: of `bc`, `cql`, `et_cql`, in this order.
-        curves: the curves.csv of `cql` and `et_cql`.
+        returns: of each policy, by name.
+        labels: what to call each policy.
         folder: to write into.
     """
     unit, episodes = comparable(dataset, returns, robot, source)
     words = {} if unit == "score" else {"quantity": unit, "title": "Return of every episode"}
-    scores.score_strip(episodes, folder / "scores.png", **words)
-    learning.learning_curves(curves, folder / "policy_curves.png", title="Policies, in training")
+    scores.score_strip(episodes, folder / "scores.png", labels=labels, **words)
 
 
-def draw_promises(promises: Promises, curves: Mapping[str, pd.DataFrame], folder: Path) -> None:
-    """`scores`, here of imagined returns, and `policy_curves`, for a robot without a simulator.
+def draw_estimates(estimates: OfflineEstimates, labels: Mapping[str, str], folder: Path) -> None:
+    """`scores`, here of imagined returns, for a robot without a simulator.
 
     Args:
-        promises: of `bc`, `cql` and `et_cql`.
-        curves: the curves.csv of `cql` and `et_cql`.
+        estimates: of each policy, by name.
+        labels: what to call each policy.
         folder: to write into.
     """
-    known = {"recorded": promises.recorded, "promised": promises.promised}
-    returns = known | {name: promise.returns for name, promise in promises.policies.items()}
+    known = {"recorded": estimates.recorded, "imagined": estimates.imagined}
+    returns = known | {name: estimate.returns for name, estimate in estimates.policies.items()}
     title = "Recorded returns, and returns in imagination alone"
-    scores.score_strip(returns, folder / "scores.png", quantity="return", title=title)
-    learning.learning_curves(curves, folder / "policy_curves.png", title="Policies, in training")
+    scores.score_strip(returns, folder / "scores.png", labels=labels, quantity="return", title=title)

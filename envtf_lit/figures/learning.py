@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from envtf_lit.figures.style import COLOURS, LABELS, drawing, write_table
+from envtf_lit.figures.style import COLOURS, drawing, policy_colours, write_table
 
 CLOCKS = ("update", "updates", "step", "epoch")  # columns that count progress rather than measure something
 TITLES = {
@@ -48,13 +48,16 @@ def tidy_curves(runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def learning_curves(runs: Mapping[str, pd.DataFrame], path: str | Path, *, title: str) -> Path:
+def learning_curves(
+    runs: Mapping[str, pd.DataFrame], path: str | Path, *, title: str, labels: Mapping[str, str] | None = None
+) -> Path:
     """One panel per quantity that was logged more than once, one line per run; validation is dashed.
 
     Args:
-        runs: name of the run (`cql`, `et_cql`, `world_model`) to its curves.csv.
+        runs: name of the run, such as a policy's, to its curves.csv.
         path: PNG to write; the numbers go beside it as CSV.
         title: over all panels.
+        labels: what to call each run.
     """
     table = tidy_curves(runs)
     order = list(TITLES)
@@ -65,7 +68,7 @@ def learning_curves(runs: Mapping[str, pd.DataFrame], path: str | Path, *, title
     rows = math.ceil(len(quantities) / columns)
     with drawing(path, (4.2 * columns, 2.9 * rows + 0.6), rows, columns) as (figure, axes):
         for axis, quantity in zip(axes.flat, quantities, strict=False):
-            _panel(axis, table.loc[table["quantity"] == quantity, :], quantity, single=len(runs) == 1)
+            _panel(axis, table.loc[table["quantity"] == quantity, :], quantity, labels or {}, tuple(runs))
         for axis in list(axes.flat)[len(quantities) :]:
             axis.set_axis_off()
         figure.suptitle(title)
@@ -75,14 +78,15 @@ def learning_curves(runs: Mapping[str, pd.DataFrame], path: str | Path, *, title
     return Path(path)
 
 
-def _panel(axis: Axes, lines: pd.DataFrame, quantity: str, *, single: bool) -> None:
+def _panel(
+    axis: Axes, lines: pd.DataFrame, quantity: str, labels: Mapping[str, str], runs: tuple[str, ...]
+) -> None:
+    single, colours = len(runs) == 1, policy_colours(runs)
     for run, split in dict.fromkeys(zip(lines["run"], lines["split"], strict=True)):
         line = lines[(lines["run"] == run) & (lines["split"] == split)]
         validated = split != "train"
-        label = (
-            ("held out" if validated else "training") if single else LABELS.get(str(run), str(run)).replace("\n", " ")
-        )
-        colour = COLOURS["imagined" if validated else "recorded"] if single else COLOURS.get(run)
+        label = ("held out" if validated else "training") if single else labels.get(str(run), str(run))
+        colour = COLOURS["imagined" if validated else "recorded"] if single else colours[str(run)]
         axis.plot(
             line["at"], line["value"], color=colour, linestyle="--" if validated else "-", label=label, marker="."
         )

@@ -19,11 +19,7 @@ from envtf_lit.robots.tasks import ROBOTS
 # Okabe and Ito's palette, which colour-blind readers can tell apart
 COLOURS = {
     "data": "#8c8c8c",
-    "bc": "#E69F00",
-    "cql": "#0072B2",
-    "et_cql": "#009E73",
     "recorded": "#333333",
-    "promised": "#D55E00",
     "imagined": "#D55E00",
     "taught": "#56B4E9",
     "threshold": "#999999",
@@ -34,16 +30,15 @@ COLOURS = {
 }
 LABELS = {
     "data": "dataset",
-    "bc": "behaviour clone",
-    "cql": "CQL on data",
-    "et_cql": "CQL on data\nand imagination",
     "world_model": "world model",
     "recorded": "recorded\n(held out)",
-    "promised": "model, on the\nrecorded actions",
+    "imagined": "model, on the\nrecorded actions",
     "transformer": "transformer",
     "context_1": "transformer, context 1",
     "ensemble": "ensemble",
 }
+# of policies, in the order of params.yaml
+POLICY_COLOURS = ("#E69F00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442")
 # of models that have no colour of their own: each colour with the first line style and marker, then with the next
 SPARE = ("#CC79A7", "#E69F00", "#F0E442", "#009E73")
 LINES = (("-", "o"), ("--", "s"), ("-.", "^"), ((0, (1, 1)), "D"))
@@ -68,6 +63,11 @@ def observation_labels(robot: str | None, observation_dim: int) -> list[str]:
         pose = ["torso height (m)", "torso pitch (rad)"]
         motion = ["x velocity (m/s)", "z velocity (m/s)", "pitch rate (rad/s)"]
     return [*pose, *angles, *motion, *rates]
+
+
+def policy_colours(names: Iterable[str]) -> dict[str, str]:
+    """A colour for each policy, in their order."""
+    return dict(zip(names, cycle(POLICY_COLOURS), strict=False))
 
 
 def featured(observation_dim: int) -> list[int]:

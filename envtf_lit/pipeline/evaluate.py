@@ -5,27 +5,26 @@ from typing import Any
 
 import pandas as pd
 
+from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.horizon import horizon_report
-from envtf_lit.evaluation.metrics import collect_metrics, collect_promises, world_model_metrics
-from envtf_lit.evaluation.offline import judge
+from envtf_lit.evaluation.metrics import collect_metrics, collect_offline_metrics, world_model_metrics
+from envtf_lit.evaluation.offline import evaluate_offline
 from envtf_lit.figures import gallery
 from envtf_lit.figures.video import no_video, real_vs_imagined
 from envtf_lit.files import replacing, write_json
 from envtf_lit.imagination.store import load_rollouts
-from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.params import Params, algorithm_of
 from envtf_lit.pipeline.stage import (
-    ALGORITHMS,
-    BEHAVIOUR,
     DATASET,
     METRICS,
     PLOTS,
     POLICIES,
-    ROLLOUTS,
     VIDEO,
-    WORLD_MODEL,
+    WORLD_MODELS,
     robot_of,
+    rollouts_file,
     run_stage,
 )
 from envtf_lit.policy import load_policy
@@ -41,48 +40,59 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
     """Scores policies and the model: `reports/metrics.json`, `plots/`, `video/`.
 
     The model is scored on held-out episodes, policies in MuJoCo. For a robot without a simulator (`task: null`) there
-    are no scores: what the model promises the policies, and how they agree with held-out actions, is all.
+    are no scores: what the model estimates for the policies, and how they agree with held-out actions, is all. The
+    video shows the last policy of `train_policy`.
     """
-    options, robot, source = params.evaluate, robot_of(params), params.download.source
+    options, name, robot, source = params.evaluate, params.evaluate.world_model, robot_of(params), params.download.source
     with run_stage("evaluate", params, root):
-        dataset, rollouts = load_dataset(root / DATASET), load_rollouts(root / ROLLOUTS)
-        model = load_world_model(root / WORLD_MODEL)
-        training, held_out = dataset.split(params.train_model.held_out, seed=params.seed)
+        dataset, rollouts = load_dataset(root / DATASET), load_rollouts(rollouts_file(root, name))
+        folder = root / WORLD_MODELS / name
+        model = load_world_model(folder)
+        training, held_out = dataset.split(params.download.held_out, seed=params.seed)
         _, held_out = calibration_split(held_out)
         scale = Scale.of(training)
         report = horizon_report(model, whole_episodes(held_out, options.trajectories, seed=params.seed), scale)
-        folders = {"bc": BEHAVIOUR, **{name: POLICIES / name for name in ALGORITHMS}}
-        policies = {name: load_policy(root / folder) for name, folder in folders.items()}
-        curves = {name: _curves(root / POLICIES / name) for name in ALGORITHMS}
-        facts: dict[str, Any] = dict(
+        policies = {policy: load_policy(root / POLICIES / policy) for policy in params.train_policy}
+        curves = {policy: _curves(root / POLICIES / policy) for policy in policies}
+        facts = dict(
             seed=params.seed,
             dataset=dataset,
-            world_model=world_model_metrics(report, scale, parameters=sum(p.numel() for p in model.parameters()))
-            | {"termination": termination_source(params.task, root / WORLD_MODEL)},
-            rollouts=len(rollouts),
+            world_model={"name": name}
+            | world_model_metrics(report, scale, parameters=sum(p.numel() for p in model.parameters()))
+            | {"termination": termination_source(params.task, folder)},
+            rollouts={"transitions": len(rollouts)},
+            labels=_labels(params),
         )
         with replacing(root / PLOTS) as plots, replacing(root / VIDEO) as video:
             plots.mkdir()
             video.mkdir()
             gallery.draw_dataset(dataset, source, plots)
-            gallery.draw_world_model(report, scale, robot, _curves(root / WORLD_MODEL), plots)
-            gallery.draw_rollouts(rollouts.step.numpy(), rollouts.uncertainty.numpy(), plots)
+            gallery.draw_world_model(report, scale, robot, _curves(folder), plots)
+            gallery.draw_rollouts(rollouts, plots)
+            gallery.draw_policy_curves(curves, _labels(params), plots)
             if robot is None:
-                promises = judge(model, policies, report, training)
-                metrics = collect_promises(promises, **facts)
-                gallery.draw_promises(promises, curves, plots)
+                estimates = evaluate_offline(model, policies, report, training)
+                metrics = collect_offline_metrics(estimates, **facts)
+                gallery.draw_estimates(estimates, _labels(params), plots)
                 no_video(video)
             else:
                 returns = {
-                    name: evaluate_policy(policy, robot, episodes=options.episodes, seed=params.seed, progress=progress)
-                    for name, policy in policies.items()
+                    policy: evaluate_policy(actor, robot, episodes=options.episodes, seed=params.seed, progress=progress)
+                    for policy, actor in policies.items()
                 }
                 metrics = collect_metrics(returns, task=str(params.task), source=source, robot=robot, **facts)
-                gallery.draw_policies(dataset, source, robot, returns, curves, plots)
-                episode, gif = returns["et_cql"].median, video / "real_vs_imagined.gif"
+                gallery.draw_scores(dataset, source, robot, returns, _labels(params), plots)
+                episode, gif = list(returns.values())[-1].median, video / "real_vs_imagined.gif"
                 real_vs_imagined(model, episode, robot, scale, gif, frames=options.video_frames)
         write_json(root / METRICS, metrics)
     return metrics
+
+
+def _labels(params: Params) -> dict[str, str]:
+    """What figures and tables call each policy: its algorithm, with its own name where several have the same."""
+    labels = {name: ALGORITHMS[algorithm_of(options)].label for name, options in params.train_policy.items()}
+    found = list(labels.values())
+    return {name: label if found.count(label) == 1 else f"{label}: {name}" for name, label in labels.items()}
 
 
 def _curves(folder: Path) -> pd.DataFrame:

@@ -1,83 +1,83 @@
-"""The stage `generate_rollouts`: clones the behaviour policy and lets it act in the world model."""
+"""The stage `generate_rollouts`: lets a cloned policy act in a world model, for the first imagined rows."""
 
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from envtf_lit.agents.bc import cloned_behaviour
 from envtf_lit.data.sources.files import load_dataset
-from envtf_lit.files import check_writable, pick_device, replacing
+from envtf_lit.files import check_writable, pick_device
 from envtf_lit.imagination.histories import BranchPoints
-from envtf_lit.imagination.rollouts import NoisyPolicy, imagine
+from envtf_lit.imagination.rollouts import NoisyPolicy, Rollouts, imagine
 from envtf_lit.imagination.store import save_rollouts
-from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.params import Params, one_of
 from envtf_lit.pipeline.stage import (
-    BEHAVIOUR,
     DATASET,
-    ROLLOUTS,
-    WORLD_MODEL,
+    POLICIES,
+    WORLD_MODELS,
     note_timing,
+    rollouts_file,
     run_settings,
     run_stage,
-    unseen,
 )
-from envtf_lit.policy import save_policy
-from envtf_lit.training import CURVES, autocast, run_folder
+from envtf_lit.policy import load_policy
+from envtf_lit.training import autocast
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination import termination_rule
 
+STRETCH = 16  # rollouts begin at as many consecutive steps of one window, which the model reads once
 
-def generate_rollouts(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
-    """Clones the behaviour policy and lets it act in the world model: `models/behaviour/`, `data/rollouts.h5`."""
 
-    options = params.generate_rollouts
-    key = run_settings(params, asdict(options)) | unseen(params)
-    with run_stage("generate_rollouts", params, root):
-        check_writable(root / ROLLOUTS, folder=False)
-        with cloned_behaviour(
-            root / DATASET,
-            options,
-            seed=params.seed,
-            run=run_folder(root, "generate_rollouts", key, [root / DATASET]),
-            target=root / BEHAVIOUR,
-            precision=params.precision,
-            progress=progress,
-            **unseen(params),
-        ) as (clone, curves):
-            with replacing(root / BEHAVIOUR) as folder:
-                save_policy(folder, clone)
-                curves.write(folder / CURVES)
-            rollouts = _imagine_first(params, root, clone)
-            save_rollouts(rollouts, root / ROLLOUTS, provenance=key | {"task": params.task})
+def generate_rollouts(
+    params: Params, root: Path = Path("."), *, name: str | None = None, progress: bool = True
+) -> dict[str, Any]:
+    """Imagines rollouts of a cloned policy in a world model: `data/rollouts/NAME.h5`.
+
+    Args:
+        params: all options.
+        root: of the project.
+        name: of the world model, a section below `train_model`; None where there is one alone.
+        progress: has nothing to show here.
+
+    Returns:
+        Numbers of transitions, terminations and halted rollouts, and the mean uncertainty.
+
+    Raises:
+        UserError: no such section, or something that the stage reads is missing.
+    """
+    name = one_of("train_model", params.train_model, name)
+    target = rollouts_file(root, name)
+    with run_stage(f"generate_rollouts_{name}", params, root):
+        check_writable(target, folder=False)
+        rollouts = _imagine(params, root, name)
+        settings = run_settings(params, params.generate_rollouts)
+        save_rollouts(rollouts, target, provenance=settings | {"task": params.task, "world_model": name})
     return {
         "transitions": len(rollouts),
         "terminated": int(rollouts.terminated.sum()),
         "halted": int(rollouts.halted.sum()),
-        "uncertainty_mean": float(rollouts.uncertainty.mean()),
+        "uncertainty_mean": float(rollouts.uncertainty[rollouts.valid].mean()),
     }
 
 
-def _imagine_first(params: Params, root: Path, clone: Any) -> Any:
-    """The clone's rollouts in the world model; their rate goes to the side file."""
-
-    options, device = params.generate_rollouts, pick_device()
-    model = load_world_model(root / WORLD_MODEL, fused=params.compile).to(device)
+def _imagine(params: Params, root: Path, name: str) -> Rollouts:
+    """The policy's rollouts in the world model; their rate goes to the side file."""
+    options, device, folder = params.generate_rollouts, pick_device(), root / WORLD_MODELS / name
+    model = load_world_model(folder, fused=params.compile).to(device)
+    policy = load_policy(root / POLICIES / options.policy).to(device)
     generator = torch.Generator(device).manual_seed(params.seed)
     points = BranchPoints(load_dataset(root / DATASET), device)
-    starts = points.draw_shared(options.branches, options.history, options.share, generator)
+    histories = points.draw_stretches(options.branches, options.history, STRETCH, generator)
     begin = time.perf_counter()
     with autocast(device, params.precision):
         rollouts = imagine(
             model,
-            NoisyPolicy(clone.to(device), options.exploration),
-            starts,
+            NoisyPolicy(policy, options.exploration),
+            histories,
             horizon=options.horizon,
-            terminated=termination_rule(params.task, root / WORLD_MODEL, device),
+            terminated=termination_rule(params.task, folder, device),
             novelty_limit=options.novelty_limit,
-            mode=options.mode,
             generator=generator,
         )
     note_timing(root, "imagined_transitions_per_second", len(rollouts) / (time.perf_counter() - begin))

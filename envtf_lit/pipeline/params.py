@@ -1,17 +1,23 @@
-"""The schema of `params.yaml`: every option of every stage, and the rules that tie options together."""
+"""The schema of `params.yaml`: every option of every stage, and the rules that tie options of several stages."""
 
 import dataclasses
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from envtf_lit.agents.options import PolicyOptions, TrainPolicyOptions, check_no_imagination, check_policy
+from envtf_lit.agents.options import NO_WORLD_MODEL, CommonOptions, PolicyOptions
+from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.data.options import DownloadOptions, check_download
-from envtf_lit.errors import UserError
-from envtf_lit.imagination.options import GenerateRolloutsOptions, ImaginationOptions
-from envtf_lit.options.schema import Precision, build
+from envtf_lit.errors import UserError, did_you_mean
+from envtf_lit.imagination.options import GenerateRolloutsOptions, RolloutOptions
+from envtf_lit.options.numbers import Count, Frames, Natural
+from envtf_lit.options.schema import Precision, build, build_tagged
 from envtf_lit.robots.tasks import get_task
-from envtf_lit.world_models.options import TrainModelOptions, check_world_model
+from envtf_lit.world_models.options import KINDS, EnsembleOptions, TransformerOptions, WorldModelOptions
+
+NAME = re.compile(r"[A-Za-z0-9][\w-]*")  # of world models and policies: they name folders
+COMMON = tuple(f.name for f in dataclasses.fields(CommonOptions))
 
 
 @dataclass(frozen=True)
@@ -19,14 +25,25 @@ class EvaluateOptions:
     """The evidence.
 
     Attributes:
+        world_model: the section below `train_model` whose model is scored and filmed.
         episodes: MuJoCo episodes per policy, seeded `seed + 1000 + i`.
         trajectories: held-out episodes on which the world model is scored over long horizons.
         video_frames: frames of the real-versus-imagined video, at most 150.
     """
 
-    episodes: int = 20
-    trajectories: int = 50
-    video_frames: int = 150
+    world_model: str = "transformer"
+    episodes: Count = 20
+    trajectories: Count = 50
+    video_frames: Frames = 150
+
+
+def _default_models() -> dict[str, WorldModelOptions]:
+    return {"transformer": TransformerOptions()}
+
+
+def _default_policies() -> dict[str, PolicyOptions]:
+    chosen = {"bc": {"return_temperature": None}, "cql": {}, "et_cql": {"world_model": "transformer"}}
+    return {name: ALGORITHMS[name].Options(**options) for name, options in chosen.items()}
 
 
 @dataclass(frozen=True)
@@ -41,21 +58,23 @@ class Params:
         compile: world models train and imagine through torch.compile, which takes a minute to begin with: pays on a
             GPU, where launching their many small operations is what takes the time.
         download: the dataset.
-        train_model: the world model.
-        generate_rollouts: the behaviour clone and its imagined rollouts.
-        train_policy: the policies.
+        train_model: world models by name; `kind` is transformer or ensemble.
+        generate_rollouts: the first imagined rollouts in each world model.
+        policy: what all policies share, unless a policy's own section says otherwise.
+        train_policy: policies by name; a further section is trained, evaluated and reported, too.
         evaluate: the evidence.
     """
 
     task: str | None = "hopper-medium-replay"
-    seed: int = 0
-    threads: int = 2
+    seed: Natural = 0
+    threads: Count = 2
     precision: Precision = "bf16"
     compile: bool = False
     download: DownloadOptions = field(default_factory=DownloadOptions)
-    train_model: TrainModelOptions = field(default_factory=TrainModelOptions)
+    train_model: dict[str, WorldModelOptions] = field(default_factory=_default_models)
     generate_rollouts: GenerateRolloutsOptions = field(default_factory=GenerateRolloutsOptions)
-    train_policy: TrainPolicyOptions = field(default_factory=TrainPolicyOptions)
+    policy: CommonOptions = field(default_factory=CommonOptions)
+    train_policy: dict[str, PolicyOptions] = field(default_factory=_default_policies)
     evaluate: EvaluateOptions = field(default_factory=EvaluateOptions)
 
 
@@ -66,13 +85,76 @@ def build_params(values: Mapping[str, Any]) -> Params:
         UserError: an unknown option (with the nearest known one), a value of the wrong type or out of range, or two
             options that contradict each other.
     """
-    params = build(Params, values, "")
+    tree = dict(values)
+    named = {name: tree.pop(name) for name in ("train_model", "train_policy") if name in tree}
+    sections = {name: build(type_, tree.pop(name), name) for name, type_ in _sections() if name in tree}
+    params = dataclasses.replace(build(Params, tree, ""), **sections)
+    if "train_model" in named:
+        models = {name: build_tagged(KINDS, "kind", item, key) for name, key, item in _named("train_model", named)}
+        params = dataclasses.replace(params, train_model=models)
+    if "train_policy" in named:
+        params = dataclasses.replace(params, train_policy=dict(_policies(params.policy, named)))
     check_rules(params)
     return params
 
 
+def _sections() -> list[tuple[str, type]]:
+    """The plain sections and their classes."""
+    return [
+        ("download", DownloadOptions),
+        ("generate_rollouts", GenerateRolloutsOptions),
+        ("policy", CommonOptions),
+        ("evaluate", EvaluateOptions),
+    ]
+
+
+def _named(stage: str, sections: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    """(name, key, values) of each section below a stage."""
+    below = sections[stage]
+    if not isinstance(below, Mapping) or not below:
+        raise UserError(f"{stage} is {below!r}, expected one section or more, each with a name of its own.")
+    for name, values in below.items():
+        if not NAME.fullmatch(str(name)) or name == NO_WORLD_MODEL:
+            raise UserError(f"{stage}.{name} cannot be called so: take letters, digits, _ and -, and not 'none'.")
+        yield str(name), f"{stage}.{name}", values
+
+
+def _policies(common: CommonOptions, sections: Mapping[str, Any]) -> Iterator[tuple[str, PolicyOptions]]:
+    """Each policy's own options over what all share."""
+    classes = {name: algorithm.Options for name, algorithm in ALGORITHMS.items()}
+    shared = dataclasses.asdict(common)
+    for name, key, values in _named("train_policy", sections):
+        whole = {**shared, **values} if isinstance(values, Mapping) else values
+        yield name, build_tagged(classes, "algorithm", whole, key)
+
+
+def algorithm_of(options: PolicyOptions) -> str:
+    """The name of the algorithm that has these options."""
+    return next(name for name, algorithm in ALGORITHMS.items() if algorithm.Options is type(options))
+
+
+def kind_of(options: WorldModelOptions) -> str:
+    """The name of the kind of world model that has these options."""
+    return next(name for name, cls in KINDS.items() if cls is type(options))
+
+
+def one_of(stage: str, sections: Mapping[str, Any], name: str | None) -> str:
+    """The name of a section below a stage: the one asked for, or the only one.
+
+    Raises:
+        UserError: there is no such section, or there are several and none is named.
+    """
+    if name is None:
+        if len(sections) == 1:
+            return next(iter(sections))
+        raise UserError(f"{stage} has the sections {', '.join(sections)}: name one of them.")
+    if name not in sections:
+        raise UserError(f"There is no section {name!r} below {stage}: {did_you_mean(name, sections)}")
+    return name
+
+
 def check_rules(params: Params) -> None:
-    """The rules that tie options together.
+    """The rules that tie options of several sections together.
 
     Raises:
         UserError: one is broken; the sentence names the options in conflict.
@@ -80,81 +162,66 @@ def check_rules(params: Params) -> None:
     if params.task is not None:
         get_task(params.task)
     check_download(params.download, named=params.task is not None)
-    check_world_model(params.train_model)
-    _check_policies(params)
-    _check_epistemic(params)
-    _check_history("generate_rollouts", params.generate_rollouts.history, params.train_model)
-
-
-def check_ranges(params: Params) -> None:
-    """Types and ranges of parameters that a program has put together; those of files pass `build_params`.
-
-    Raises:
-        UserError: an option is of the wrong type or out of range.
-    """
-    build(Params, dataclasses.asdict(params), "")
-
-
-def _check_policies(params: Params) -> None:
-    policies = params.train_policy
-    check_no_imagination(policies.cql, "train_policy.cql")
-    if policies.et_cql.imagination is None:
+    first = params.generate_rollouts
+    for name, model in params.train_model.items():
+        _check_history("generate_rollouts", first.history, name, model)
+        _check_epistemic("generate_rollouts.novelty_limit", first.novelty_limit, name, model)
+    one_of("train_model", params.train_model, params.evaluate.world_model)
+    one_of("train_policy", params.train_policy, first.policy)
+    if params.train_policy[first.policy].world_model != NO_WORLD_MODEL:
         raise UserError(
-            "train_policy.et_cql.imagination is null: give it a section, since train_policy.cql is without."
+            f"generate_rollouts.policy is {first.policy}, which itself learns from imagined rollouts: name one from "
+            "data alone, such as bc."
         )
-    check_policy(policies.cql, "train_policy.cql")
-    check_policy(policies.et_cql, "train_policy.et_cql")
-    _check_imagination(policies.et_cql, policies.et_cql.imagination, params.train_model)
+    for name, policy in params.train_policy.items():
+        _check_policy(f"train_policy.{name}", policy, params)
 
 
-def _check_imagination(policy: PolicyOptions, imagination: ImaginationOptions, model: TrainModelOptions) -> None:
-    section, climbing = "train_policy.et_cql.imagination", imagination.value_gradient
-    _check_history(section, imagination.history, model)
-    if climbing is None:
+def _check_policy(section: str, options: PolicyOptions, params: Params) -> None:
+    algorithm = algorithm_of(options)
+    model = options.world_model
+    if not ALGORITHMS[algorithm].imagines:
+        if model != NO_WORLD_MODEL:
+            raise UserError(f"{section}.world_model is {model}, and {algorithm} learns from data alone: set it to none.")
         return
-    if climbing.horizon < imagination.history:
+    if model == NO_WORLD_MODEL:
         raise UserError(
-            f"{section}.value_gradient.horizon is {climbing.horizon} and history is {imagination.history}: rollouts "
-            "carried on take their history from the steps before, so take a horizon of at least that."
+            f"{section}.world_model is none, and {algorithm} imagines: name a section below train_model, such as "
+            f"{next(iter(params.train_model))}."
         )
-    if climbing.updates > policy.updates - policy.warm_start:
-        raise UserError(
-            f"{section}.value_gradient.updates is {climbing.updates}, and {policy.updates - policy.warm_start} updates "
-            "come after the warm start: take no more than those."
-        )
+    if model not in params.train_model:
+        raise UserError(f"{section}.world_model is {model!r}: {did_you_mean(model, params.train_model)}")
+    rollouts: RolloutOptions = options.rollouts  # pyright: ignore[reportAttributeAccessIssue]
+    trained = params.train_model[model]
+    _check_history(f"{section}.rollouts", rollouts.history, model, trained)
+    _check_epistemic(f"{section}.rollouts.novelty_limit", rollouts.novelty_limit, model, trained)
+    _check_epistemic(f"{section}.rollouts.posterior", rollouts.posterior or None, model, trained)
 
 
-def _check_epistemic(params: Params) -> None:
-    imagination, train = params.train_policy.et_cql.imagination, params.train_model
-    assert imagination is not None
-    for key, value in (
-        ("generate_rollouts.novelty_limit", params.generate_rollouts.novelty_limit),
-        ("train_policy.et_cql.imagination.novelty_limit", imagination.novelty_limit),
-        ("train_policy.et_cql.imagination.posterior", imagination.posterior or None),
-    ):
-        drawn = key.endswith("posterior")
-        lacking = _lacking(train, drawn=drawn)
-        if value is not None and lacking is not None:
-            raise UserError(f"{key} is {value} and {lacking}, or the first to {0 if drawn else 'null'}.")
+def _check_epistemic(key: str, value: float | None, name: str, model: WorldModelOptions) -> None:
+    drawn = key.endswith("posterior")
+    lacking = _lacking(f"train_model.{name}", model, drawn=drawn)
+    if value is not None and lacking is not None:
+        raise UserError(f"{key} is {value} and {lacking}, or the first to {0 if drawn else 'null'}.")
 
 
-def _lacking(options: TrainModelOptions, *, drawn: bool) -> str | None:
+def _lacking(section: str, options: WorldModelOptions, *, drawn: bool) -> str | None:
     """What leaves a world model without epistemic variance, or without a posterior to be drawn from, and the remedy."""
-    ensemble, epistemic = options.ensemble, options.model.epistemic
-    if ensemble is None:
-        if epistemic == "laplace":
+    if isinstance(options, TransformerOptions):
+        if options.epistemic == "laplace":
             return None
-        return f"train_model.model.epistemic is {epistemic}, which has no posterior: set that to laplace"
+        return f"{section}.epistemic is {options.epistemic}, which has no posterior: set that to laplace"
     name = "elites" if drawn else "members"  # rollouts follow an elite; all members disagree
-    if getattr(ensemble, name) > 1:
+    if getattr(options, name) > 1:
         return None
-    return f"train_model.ensemble.{name} is 1, which has no other to differ from: set that to 2 or more"
+    return f"{section}.{name} is 1, which has no other to differ from: set that to 2 or more"
 
 
-def _check_history(section: str, history: int, options: TrainModelOptions) -> None:
-    context = options.model.context
-    if options.ensemble is None and history > context - 1:  # an ensemble takes any, and looks at the last step alone
+def _check_history(section: str, history: int, name: str, model: WorldModelOptions) -> None:
+    if isinstance(model, EnsembleOptions):  # takes any, and looks at the last step alone
+        return
+    if history > model.context - 1:
         raise UserError(
-            f"{section}.history is {history} and train_model.model.context is {context}: the model remembers at most "
-            f"{context - 1} steps before the present one."
+            f"{section}.history is {history} and train_model.{name}.context is {model.context}: the model remembers at "
+            f"most {model.context - 1} steps before the present one."
         )

@@ -4,22 +4,31 @@ import contextlib
 import resource
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
 
+from envtf_lit.agents.options import NO_WORLD_MODEL, PolicyOptions
 from envtf_lit.files import read_json, write_json
 from envtf_lit.pipeline.params import Params
 from envtf_lit.robots.tasks import Robot, get_task
+from envtf_lit.world_models.options import WorldModelOptions
 
 DATASET, CARD = Path("data/dataset.h5"), Path("data/dataset.json")
-WORLD_MODEL, BEHAVIOUR = Path("models/world_model"), Path("models/behaviour")
-ROLLOUTS, POLICIES = Path("data/rollouts.h5"), Path("models/policy")
+WORLD_MODELS, POLICIES = Path("models/world_model"), Path("models/policy")  # a folder below for each name
+ROLLOUTS = Path("data/rollouts")  # a file below for each world model
 REPORTS, METRICS = Path("reports"), Path("reports/metrics.json")
 PLOTS, VIDEO = Path("reports/plots"), Path("reports/video")
-ALGORITHMS = ("cql", "et_cql")
+# what a policy from data alone reads in place of a world model and its rollouts, so that DVC has a file to name
+NOTHING = (WORLD_MODELS / NO_WORLD_MODEL, ROLLOUTS / f"{NO_WORLD_MODEL}.h5")
+
+
+def rollouts_file(root: Path, world_model: str) -> Path:
+    """The rollouts that `generate_rollouts` stored in this world model."""
+    return root / ROLLOUTS / f"{world_model}.h5"
 
 
 def robot_of(params: Params) -> Robot | None:
@@ -29,13 +38,13 @@ def robot_of(params: Params) -> Robot | None:
 
 def unseen(params: Params) -> dict[str, float]:
     """What policies must not see: where no simulator can score them, held-out actions have to."""
-    return {"held_out": params.train_model.held_out} if params.task is None else {}
+    return {"held_out": params.download.held_out} if params.task is None else {}
 
 
-def run_settings(params: Params, options: dict[str, Any]) -> dict[str, Any]:
+def run_settings(params: Params, options: WorldModelOptions | PolicyOptions | Any) -> dict[str, Any]:
     """What a run's result depends on, beside its input files."""
     common = {name: getattr(params, name) for name in ("seed", "threads", "precision", "compile")}
-    return common | {"options": options}
+    return common | {"held_out": params.download.held_out, "options": asdict(options)}
 
 
 @contextlib.contextmanager

@@ -1,22 +1,22 @@
 """The stage `train_policy`: trains a policy on data alone, or on data and imagination."""
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.agents.store import publish_policy
-from envtf_lit.data.loaders import TransitionData, return_weights
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.loaders import UPDATES_PER_STEP, TransitionData, return_weights
 from envtf_lit.files import pick_device
-from envtf_lit.imagination.rollouts import Imagination
+from envtf_lit.imagination.buffer import ImaginedBatches, Imagination
 from envtf_lit.imagination.store import load_rollouts
-from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.params import Params, algorithm_of, one_of
 from envtf_lit.pipeline.stage import (
     DATASET,
     POLICIES,
-    ROLLOUTS,
-    WORLD_MODEL,
+    WORLD_MODELS,
+    rollouts_file,
     run_settings,
     run_stage,
     unseen,
@@ -27,66 +27,90 @@ from envtf_lit.world_models.termination import termination_rule
 
 
 def train_policy(
-    params: Params, root: Path = Path("."), *, algorithm: str = "et_cql", progress: bool = True
+    params: Params, root: Path = Path("."), *, name: str | None = None, progress: bool = True
 ) -> dict[str, Any]:
-    """Trains `cql` (data alone) or `et_cql` (data and imagination): `models/policy/<algorithm>/`."""
+    """Trains a policy: `models/policy/NAME/`.
 
-    options: PolicyOptions = getattr(params.train_policy, algorithm)
-    with run_stage(f"train_policy_{algorithm}", params, root):
-        data = TransitionData(
-            str(root / DATASET),
-            batch_size=options.batch_size,
-            updates_per_step=options.updates_per_step,
-            steps_per_epoch=options.updates_per_epoch // options.updates_per_step,
-            discount=options.discount,
-            n_step=options.n_step,
-            return_temperature=options.return_temperature,
-            **unseen(params),
-            seed=params.seed,
-        )
-        agent = CQL(
+    Args:
+        params: all options.
+        root: of the project.
+        name: of the section below `train_policy`; None where there is one alone.
+        progress: shows a bar.
+
+    Returns:
+        The last row of the training's curves.
+
+    Raises:
+        UserError: no such section, or something that the stage reads is missing.
+    """
+    name = one_of("train_policy", params.train_policy, name)
+    options, target = params.train_policy[name], root / POLICIES / name
+    with run_stage(f"train_policy_{name}", params, root):
+        algorithm = ALGORITHMS[algorithm_of(options)]
+        data = transition_data(root / DATASET, options, seed=params.seed, **unseen(params))
+        agent = algorithm(
             data.observation_dim,
             data.action_dim,
             options,
             action_low=data.action_low,
             action_high=data.action_high,
             seed=params.seed,
+            source=imagined_batches(params, root, options, data.dataset) if algorithm.imagines else None,
         )
-        inputs, monitor = [root / DATASET], None
-        if options.imagination is not None:
-            _give_imagination(agent, params, root, data.dataset)
-            inputs += [root / WORLD_MODEL, root / ROLLOUTS]
-            monitor = "val/imagined_return" if options.imagination.selection_episodes > 0 else None
-        key = run_settings(params, asdict(options)) | unseen(params)
-        target = root / POLICIES / algorithm
+        inputs = [root / DATASET]
+        if algorithm.imagines:
+            inputs += [root / WORLD_MODELS / options.world_model, rollouts_file(root, options.world_model)]
+        settings = run_settings(params, options) | {"algorithm": algorithm_of(options)}
         with trained(
             agent,
             data,
-            run=run_folder(root, f"train_policy_{algorithm}", key, inputs),
+            run=run_folder(root, f"train_policy_{name}", settings, inputs),
             target=target,
             epochs=options.updates // options.updates_per_epoch,
             precision=params.precision,
             progress=progress,
-            monitor=monitor,
-            mode="max",
             validate=False,
         ) as curves:
-            kept = max(curves.rows, key=lambda row: row[monitor]) if monitor else curves.rows[-1]
-            return publish_policy(target, agent.average_actor, curves, kept, key)
+            return publish_policy(target, agent.average_actor, curves, curves.rows[-1], settings)
 
 
-def _give_imagination(agent: Any, params: Params, root: Path, dataset: Any) -> None:
-    """Hands an agent the world model and the stored rollouts."""
-    device = pick_device()
-    model = load_world_model(root / WORLD_MODEL, fused=params.compile).to(device)
-    temperature = agent.options.return_temperature
-    weights = None if temperature is None else return_weights(dataset, temperature)  # as the real rows are drawn
-    imagination = Imagination(
-        model,
-        dataset,
-        termination_rule(params.task, root / WORLD_MODEL, device),
-        agent.options.imagination,
-        device,
-        weights,
+def transition_data(dataset: Path, options: PolicyOptions, *, seed: int, held_out: float = 0.0) -> TransitionData:
+    """The rows that such options are trained on.
+
+    Args:
+        dataset: HDF5 or NPZ.
+        options: of the policy.
+        seed: of the draws, and of the split.
+        held_out: share of the episodes left out.
+    """
+    return TransitionData(
+        str(dataset),
+        batch_size=options.batch_size,
+        steps_per_epoch=options.updates_per_epoch // UPDATES_PER_STEP,
+        discount=options.discount,
+        n_step=options.n_step,
+        return_temperature=options.return_temperature,
+        held_out=held_out,
+        seed=seed,
     )
-    agent.dream_with(imagination, load_rollouts(root / ROLLOUTS), reward_std=float(dataset.rewards.std()))
+
+
+def imagined_batches(params: Params, root: Path, options: Any, dataset: OfflineDataset) -> ImaginedBatches:
+    """The source of imagined rows that a policy's options name."""
+    device, folder = pick_device(), root / WORLD_MODELS / options.world_model
+    temperature = options.return_temperature
+    imagination = Imagination(
+        load_world_model(folder, fused=params.compile).to(device),
+        dataset,
+        termination_rule(params.task, folder, device),
+        options.rollouts,
+        device,
+        weights=None if temperature is None else return_weights(dataset, temperature),  # as the real rows are drawn
+    )
+    return ImaginedBatches(
+        imagination,
+        load_rollouts(rollouts_file(root, options.world_model)),
+        real_ratio=options.real_ratio,
+        refresh_every=options.refresh_every,
+        discount=options.discount,
+    )

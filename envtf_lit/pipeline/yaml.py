@@ -8,17 +8,21 @@ from decimal import Decimal
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_origin, get_type_hints
 
 from docstring_parser import parse as parse_docstring
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.pipeline.params import Params, build_params
+from envtf_lit.options.schema import kind, options_class
+from envtf_lit.pipeline.params import COMMON, Params, algorithm_of, build_params, kind_of
+from envtf_lit.world_models.options import KINDS
 
 PRESETS = ("tiny", "small", "base", "paper")
 WIDTH = 120
+NAMED = {"train_model": "kind", "train_policy": "algorithm"}  # stages with named sections, and the tag of each
 
 
 def load_params(path: str | Path = "params.yaml", overrides: Sequence[str] = ()) -> Params:
@@ -36,9 +40,10 @@ def load_params(path: str | Path = "params.yaml", overrides: Sequence[str] = ())
         raise UserError(f"{path} does not exist: run `envtf init .` to write one, or give --params.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"Cannot read {path} ({error}): give a YAML file.") from None
-    values = _parse(text, str(path)) or {}
     try:
-        return build_params(_overlay(dump_params(Params()), values, *map(_override, overrides)))
+        values = _parse(text, str(path)) or {}
+        missing = {name: dump_params(Params())[name] for name in NAMED if name not in values}
+        return build_params(_overlay({**values, **missing}, *map(_override, overrides)))
     except UserError as error:
         raise UserError(f"{path}: {error}" if not overrides else str(error)) from None
 
@@ -52,12 +57,27 @@ def preset_params(name: str) -> Params:
     if name not in PRESETS:
         raise UserError(f"Unknown preset {name!r}: {did_you_mean(name, PRESETS)}")
     text = resources.files("envtf_lit").joinpath(f"configs/presets/{name}.yaml").read_text()
-    return build_params(_overlay(dump_params(Params()), _parse(text, name) or {}))
+    below, preset = dump_params(Params()), _parse(text, name) or {}
+    for stage, tag in NAMED.items():
+        for section, values in preset.get(stage, {}).items():
+            if tag in values:  # another algorithm, which has other options
+                below[stage].pop(section, None)
+    return build_params(_overlay(below, preset))
 
 
 def dump_params(params: Params) -> dict[str, Any]:
-    """All options as nested dictionaries of numbers, strings, lists and None: ready for JSON."""
-    return json.loads(json.dumps(dataclasses.asdict(params)))  # tuples become lists
+    """All options as nested dictionaries of numbers, strings, lists and None: ready for JSON, and for `build_params`.
+
+    A policy's section has its algorithm, the options of its own, and those of `policy` in which it differs.
+    """
+    tree = dataclasses.asdict(params)
+    for name, model in params.train_model.items():
+        tree["train_model"][name] = {"kind": kind_of(model)} | dataclasses.asdict(model)
+    for name, options in params.train_policy.items():
+        common = dataclasses.asdict(params.policy)
+        own = {key: x for key, x in dataclasses.asdict(options).items() if key not in COMMON or x != common[key]}
+        tree["train_policy"][name] = {"algorithm": algorithm_of(options)} | own
+    return json.loads(json.dumps(tree))  # tuples become lists
 
 
 def params_yaml(params: Params) -> str:
@@ -80,38 +100,44 @@ def describe(section: str) -> list[Option]:
     """The options of a part of `params.yaml`, such as `seed` or `train_policy.cql`, with defaults and meanings."""
     cls, values = Params, dump_params(Params())
     names = section.split(".")
-    for name in names[:-1]:
-        cls, values = _section(cls, name), values[name]
-    return list(_options(cls, names[-1], values[names[-1]], ".".join(names)))
+    for depth, name in enumerate(names[:-1]):
+        cls, values = _section(cls, name, values[name], names[depth - 1] if depth else ""), values[name]
+    parent = names[-2] if len(names) > 1 else ""
+    return list(_options(cls, names[-1], values[names[-1]], ".".join(names), parent))
 
 
-def _options(cls: Any, name: str, value: Any, key: str) -> Iterator[Option]:
-    inner = _section(cls, name)
+def _options(cls: Any, name: str, value: Any, key: str, parent: str = "") -> Iterator[Option]:
+    inner = _section(cls, name, value, parent)
     if inner is None:
-        yield Option(key, _kind(get_type_hints(cls)[name]), value, meanings(cls)[name])
+        yield Option(key, kind(get_type_hints(cls)[name]), value, meanings(cls)[name])
     elif value is not None:
-        for field in dataclasses.fields(inner):
-            yield from _options(inner, field.name, value[field.name], f"{key}.{field.name}")
+        names = value if parent == "" and name in NAMED else [n for n in _fields(inner) if n in value]
+        for below in names:
+            yield from _options(inner, below, value[below], f"{key}.{below}", name)
 
 
-def _section(cls: Any, name: str) -> Any:
-    """The dataclass behind a field, looking through `X | None`, or None where it is a plain value."""
-    hint = get_type_hints(cls)[name]
-    return next((x for x in (hint, *get_args(hint)) if dataclasses.is_dataclass(x)), None)
+def _fields(cls: Any) -> list[str]:
+    return [field.name for field in dataclasses.fields(cls)]
 
 
-def _kind(hint: Any) -> str:
-    if get_origin(hint) is Literal:
-        return " | ".join(get_args(hint))
-    if get_origin(hint) is tuple:
-        return f"list of {_kind(get_args(hint)[0])}"
-    return hint.__name__ if isinstance(hint, type) else str(hint).replace("None", "null")
+def _section(cls: Any, name: str, value: Any, parent: str) -> Any:
+    """The dataclass behind a name, or None where it is a plain value; below a stage with named sections by its tag."""
+    if parent in NAMED:
+        tag = value[NAMED[parent]]
+        return KINDS[tag] if parent == "train_model" else ALGORITHMS[tag].Options
+    if cls is Params and name in NAMED:
+        return Params
+    return options_class(get_type_hints(cls)[name])
 
 
 @cache
 def meanings(cls: type) -> dict[str, str]:
-    """What each field of an options class means, from its docstring."""
-    return {p.arg_name: " ".join((p.description or "").split()) for p in parse_docstring(cls.__doc__ or "").params}
+    """What each field of an options class means, from its docstring and those of the classes it extends."""
+    found: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        parsed = parse_docstring(base.__doc__ or "").params
+        found |= {p.arg_name: " ".join((p.description or "").split()) for p in parsed}
+    return found
 
 
 def _parse(text: str, where: str) -> Any:
@@ -142,25 +168,34 @@ def _overlay(below: Any, *above: Any) -> Any:
     return below
 
 
-def _yaml_lines(cls: Any, values: Mapping[str, Any], depth: int, explained: set[tuple[type, str]]) -> Iterator[str]:
-    """One line an option; an options class that comes twice is explained once."""
-    for field in dataclasses.fields(cls):
-        value = values[field.name]
+def _yaml_lines(cls: Any, values: Mapping[str, Any], depth: int, explained: set[str]) -> Iterator[str]:
+    """One line an option; an option that comes twice with the same meaning is explained once."""
+    for name, value in values.items():
         nested = isinstance(value, Mapping)
-        line = f"{'  ' * depth}{field.name}:" + ("" if nested else f" {_scalar(value)}")
+        line = f"{'  ' * depth}{name}:" + ("" if nested else f" {_scalar(value)}")
         if depth == 0 and nested:
             yield ""
-        yield line if (cls, field.name) in explained else _commented(line, cls, field.name)
-        explained.add((cls, field.name))
-        if nested:
-            yield from _yaml_lines(_section(cls, field.name), value, depth + 1, explained)
+        yield _commented(line, cls, name, explained)
+        if not nested:
+            continue
+        if depth == 0 and name in NAMED:
+            for below, section in value.items():
+                yield f"  {below}:"
+                yield f"    {NAMED[name]}: {section[NAMED[name]]}  # {' | '.join(KINDS if name == 'train_model' else ALGORITHMS)}"
+                rest = {key: item for key, item in section.items() if key != NAMED[name]}
+                yield from _yaml_lines(_section(None, below, section, name), rest, 2, explained)
+        else:
+            yield from _yaml_lines(_section(cls, name, value, ""), value, depth + 1, explained)
 
 
-def _commented(line: str, cls: Any, name: str) -> str:
+def _commented(line: str, cls: Any, name: str, explained: set[str]) -> str:
     """The choices, or the meaning where it fits, else its first clause: `envtf COMMAND --help` has the whole of it."""
     hint, meaning = get_type_hints(cls)[name], meanings(cls)[name].rstrip(".")
+    if f"{name}: {meaning}" in explained:
+        return line
+    explained.add(f"{name}: {meaning}")
     if get_origin(hint) is Literal:
-        return f"{line}  # {_kind(hint)}"
+        return f"{line}  # {kind(hint)}"
     whole = f"{line}  # {meaning}"
     return whole if len(whole) <= WIDTH else f"{line}  # {re.split(r'[;.:] | [(]', meaning)[0]}"
 

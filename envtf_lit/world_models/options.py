@@ -1,9 +1,10 @@
-"""The options of world models and of their training."""
+"""The options of world models and of their training: one class a kind."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from envtf_lit.errors import UserError
+from envtf_lit.options.numbers import Count, Natural, NonNegative, Positive, Share
 from envtf_lit.options.schema import check_epochs
 
 
@@ -27,28 +28,62 @@ class ModelOptions:
             more detect strange pairs better, and its time grows with their square.
         bounded: predictions stay within the range of the training data, widened by a tenth of it at either end, so that
             no rollout runs away.
-        scheduled_sampling: share of the input states that, in training, are the model's own predictions, which it
-            learns to correct; above 0 a second forward pass per update.
-        multi_step: passes per update, each from the states that the one before predicted, with gradients through all;
-            1 trains one-step prediction alone.
-        any_step: largest share of the states that are hidden in training, drawn for each window: predictions then start
-            from the last state shown, and follow the actions alone.
     """
 
-    layers: int = 4
-    heads: int = 4
-    width: int = 128
-    context: int = 16
-    dropout: float = 0.0
+    layers: Count = 4
+    heads: Count = 4
+    width: Count = 128
+    context: Count = 16
+    dropout: Share = 0.0
     activation: Literal["relu", "gelu"] = "gelu"
     objective: Literal["beta_nll", "nll", "paper_mse"] = "beta_nll"
     target: Literal["delta", "absolute"] = "delta"
     epistemic: Literal["laplace", "head", "none"] = "laplace"
-    random_features: int = 128
+    random_features: Natural = 128
     bounded: bool = False
-    scheduled_sampling: float = 0.0
-    multi_step: int = 1
-    any_step: float = 0.0
+
+
+@dataclass(frozen=True)
+class TransformerOptions(ModelOptions):
+    """The Environment Transformer and how it is trained.
+
+    Attributes:
+        updates: gradient steps in all.
+        updates_per_epoch: gradient steps between two validations (and resumable checkpoints).
+        batch_size: windows of `context` steps per gradient step.
+        learning_rate: peak, reached after `warmup` of the updates, then a cosine to zero.
+        warmup: share of the updates, in [0, 1).
+        weight_decay: AdamW's, on matrices only.
+        eps: AdamW's.
+        gradient_clip: largest gradient norm.
+    """
+
+    updates: Count = 6_000
+    updates_per_epoch: Count = 1_000
+    batch_size: Count = 32
+    learning_rate: Positive = 0.001
+    warmup: Share = 0.05
+    weight_decay: NonNegative = 0.0001
+    eps: Positive = 0.00000001
+    gradient_clip: Positive = 1.0
+
+    def __post_init__(self) -> None:
+        check_epochs(self)
+        if self.width % (2 * self.heads):
+            raise UserError(
+                f"width is {self.width} and heads is {self.heads}: each head needs an even share, so take a width "
+                f"that is a multiple of {2 * self.heads}."
+            )
+        if self.objective == "paper_mse" and self.epistemic != "head":
+            raise UserError(
+                f"objective is paper_mse and epistemic is {self.epistemic}: that objective trains the paper's third "
+                "head, so set epistemic to head."
+            )
+
+    @property
+    def model(self) -> ModelOptions:
+        """Architecture and objective alone."""
+        return ModelOptions(**{field.name: getattr(self, field.name) for field in fields(ModelOptions)})
 
 
 @dataclass(frozen=True)
@@ -67,89 +102,29 @@ class EnsembleOptions:
         patience: epochs without a member whose held-out error falls by 1 %, after which training stops.
     """
 
-    members: int = 7
-    elites: int = 5
-    hidden: tuple[int, ...] = (200, 200, 200, 200)
-    updates: int = 100_000
-    updates_per_epoch: int = 500
-    batch_size: int = 256
-    learning_rate: float = 0.001
-    weight_decay: tuple[float, ...] = (0.000025, 0.00005, 0.000075, 0.000075, 0.0001)
-    patience: int = 5
+    members: Count = 7
+    elites: Count = 5
+    hidden: tuple[Count, ...] = (200, 200, 200, 200)
+    updates: Count = 100_000
+    updates_per_epoch: Count = 500
+    batch_size: Count = 256
+    learning_rate: Positive = 0.001
+    weight_decay: tuple[NonNegative, ...] = (0.000025, 0.00005, 0.000075, 0.000075, 0.0001)
+    patience: Count = 5
+
+    def __post_init__(self) -> None:
+        check_epochs(self)
+        if self.elites > self.members:
+            raise UserError(
+                f"elites is {self.elites} and members is {self.members}: elites are chosen from the members, so take "
+                "no more than those."
+            )
+        if len(self.weight_decay) != len(self.hidden) + 1:
+            raise UserError(
+                f"weight_decay has {len(self.weight_decay)} entries and there are {len(self.hidden) + 1} layers, the "
+                "output layer among them: give one for each."
+            )
 
 
-@dataclass(frozen=True)
-class TrainModelOptions:
-    """How the world model is trained.
-
-    Attributes:
-        model: architecture and objective.
-        ensemble: a section trains the ensemble in place of the transformer, and of this section only `held_out` is
-            read beside it; null trains the transformer.
-        updates: gradient steps in all.
-        updates_per_epoch: gradient steps between two validations (and resumable checkpoints).
-        batch_size: windows of `model.context` steps per gradient step.
-        learning_rate: peak, reached after `warmup` of the updates, then a cosine to zero.
-        warmup: share of the updates, in [0, 1).
-        weight_decay: AdamW's, on matrices only.
-        eps: AdamW's.
-        gradient_clip: largest gradient norm.
-        held_out: share of the episodes kept for validation.
-    """
-
-    model: ModelOptions = field(default_factory=ModelOptions)
-    ensemble: EnsembleOptions | None = None
-    updates: int = 6_000
-    updates_per_epoch: int = 1_000
-    batch_size: int = 32
-    learning_rate: float = 0.001
-    warmup: float = 0.05
-    weight_decay: float = 0.0001
-    eps: float = 0.00000001
-    gradient_clip: float = 1.0
-    held_out: float = 0.1
-
-
-def check_world_model(options: TrainModelOptions, section: str = "train_model") -> None:
-    """The rules that tie the world model's options together; what an ensemble does not read may be anything.
-
-    Args:
-        options: of model and training.
-        section: what errors call them.
-
-    Raises:
-        UserError: one is broken.
-    """
-    if options.ensemble is None:
-        _check_model(f"{section}.model", options.model)
-        check_epochs(section, options)
-    else:
-        check_epochs(f"{section}.ensemble", options.ensemble)
-        _check_ensemble(f"{section}.ensemble", options.ensemble)
-
-
-def _check_model(section: str, model: ModelOptions) -> None:
-    if model.width % (2 * model.heads):
-        raise UserError(
-            f"{section}.width is {model.width} and heads is {model.heads}: each head needs an even share, so take a "
-            f"width that is a multiple of {2 * model.heads}."
-        )
-
-    if model.objective == "paper_mse" and model.epistemic != "head":
-        raise UserError(
-            f"{section}.objective is paper_mse and epistemic is {model.epistemic}: that objective trains the paper's "
-            "third head, so set epistemic to head."
-        )
-
-
-def _check_ensemble(section: str, options: EnsembleOptions) -> None:
-    if options.elites > options.members:
-        raise UserError(
-            f"{section}.elites is {options.elites} and members is {options.members}: elites are chosen from the "
-            "members, so take no more than those."
-        )
-    if len(options.weight_decay) != len(options.hidden) + 1:
-        raise UserError(
-            f"{section}.weight_decay has {len(options.weight_decay)} entries and there are {len(options.hidden) + 1} "
-            "layers, the output layer among them: give one for each."
-        )
+WorldModelOptions = TransformerOptions | EnsembleOptions
+KINDS: dict[str, type[WorldModelOptions]] = {"transformer": TransformerOptions, "ensemble": EnsembleOptions}
