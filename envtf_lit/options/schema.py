@@ -32,7 +32,7 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("updates_per_step", "batch_size", "clone_updates", "clone_batch_size", "branches"), _COUNT),
     **dict.fromkeys(("horizon", "buffer_size", "hidden", "critics", "sampled_actions", "episodes"), _COUNT),
     **dict.fromkeys(("trajectories", "n_step", "selection_steps", "members", "elites", "patience"), _COUNT),
-    **dict.fromkeys(("rollouts", "share", "max_steps", "value_passes", "multi_step"), _COUNT),
+    **dict.fromkeys(("rollouts", "share", "max_steps", "value_passes"), _COUNT),
     **dict.fromkeys(
         ("seed", "weight_decay", "history", "exploration", "refresh_every", "penalty", "tail", "posterior"),
         _NOT_NEGATIVE,
@@ -53,7 +53,7 @@ RANGES: dict[str, Range] = {
         ),
         _POSITIVE,
     ),
-    **dict.fromkeys(("dropout", "scheduled_sampling", "any_step", "warmup", "discount", "trace"), _SHARE),
+    **dict.fromkeys(("dropout", "warmup", "discount", "trace"), _SHARE),
     "held_out": _INNER_SHARE,
     **dict.fromkeys(("real_ratio", "target_rate", "actor_average"), _NONZERO_SHARE),
     "transitions": Range(lambda value: value >= 1000, "1000 or more"),

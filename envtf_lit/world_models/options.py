@@ -27,12 +27,6 @@ class ModelOptions:
             more detect strange pairs better, and its time grows with their square.
         bounded: predictions stay within the range of the training data, widened by a tenth of it at either end, so that
             no rollout runs away.
-        scheduled_sampling: share of the input states that, in training, are the model's own predictions, which it
-            learns to correct; above 0 a second forward pass per update.
-        multi_step: passes per update, each from the states that the one before predicted, with gradients through all;
-            1 trains one-step prediction alone.
-        any_step: largest share of the states that are hidden in training, drawn for each window: predictions then start
-            from the last state shown, and follow the actions alone.
     """
 
     layers: int = 4
@@ -46,9 +40,6 @@ class ModelOptions:
     epistemic: Literal["laplace", "head", "none"] = "laplace"
     random_features: int = 128
     bounded: bool = False
-    scheduled_sampling: float = 0.0
-    multi_step: int = 1
-    any_step: float = 0.0
 
 
 @dataclass(frozen=True)

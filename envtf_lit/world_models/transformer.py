@@ -172,30 +172,8 @@ class EnvironmentTransformer(nn.Module):
 
     def loss(self, batch: dict[str, Tensor], *, generator: torch.Generator | None = None) -> Tensor:
         """Mean objective per valid token and output dimension of a batch of windows (see `data.loaders.Windows`)."""
-        observations, actions, options = batch["observations"], batch["actions"], self.options
-        if self.training and options.any_step > 0.0:
-            observations = self._partly_hidden(observations)
-        if self.training and options.scheduled_sampling > 0.0:
-            observations = self._partly_imagined(observations, actions)
-        passes = options.multi_step if self.training else 1
-        total = torch.zeros((), device=observations.device)
-        for number in range(passes):
-            outputs = self(observations, actions)
-            total = total + self._objective(outputs, observations, batch, generator)
-            if number + 1 < passes:
-                observations = self._one_step_ahead(outputs[0], observations)
-        return total / passes
-
-    def _objective(
-        self,
-        outputs: tuple[Tensor, Tensor, Tensor | None],
-        observations: Tensor,
-        batch: dict[str, Tensor],
-        generator: torch.Generator | None,
-    ) -> Tensor:
-        """The objective of predictions from these observations, which need not be the true ones."""
-        mean, log_variance, epistemic = outputs
-        target = self.normaliser.target(observations, batch["next_observations"], batch["rewards"])
+        mean, log_variance, epistemic = self(batch["observations"], batch["actions"])
+        target = self.normaliser.target(batch["observations"], batch["next_observations"], batch["rewards"])
         if self.options.objective == "paper_mse":
             assert epistemic is not None
             loss = paper_mse(mean, log_variance, epistemic, target, generator=generator)
@@ -204,33 +182,6 @@ class EnvironmentTransformer(nn.Module):
                 log_variance = torch.logaddexp(log_variance, epistemic)
             loss = {"nll": nll, "beta_nll": beta_nll}[self.options.objective](mean, log_variance, target)
         return (loss * batch["mask"]).sum() / (batch["mask"].sum() * target.shape[-1])
-
-    def _one_step_ahead(self, mean: Tensor, observations: Tensor) -> Tensor:
-        """What the model makes of each state (B, T, S) stands in the next one's place; the first one stays."""
-        imagined = self.normaliser.outcome(observations, mean)[:, :-1, :-1]
-        return torch.cat([observations[:, :1], imagined], dim=1)
-
-    def _partly_hidden(self, observations: Tensor) -> Tensor:
-        """Observations (B, T, S), some of them replaced by the last one shown, a share of its own in each window.
-
-        The model then predicts several steps ahead from the actions alone (any-step dynamics, Lin et al. 2024).
-        """
-        B, T, _ = observations.shape
-        share = self.options.any_step * torch.rand(B, 1, device=observations.device)
-        hidden = torch.rand(B, T, device=observations.device) < share
-        hidden[:, 0] = False
-        shown = torch.arange(T, device=observations.device).expand(B, T).masked_fill(hidden, 0).cummax(1).values
-        return torch.take_along_dim(observations, shown[..., None], 1)
-
-    @torch.no_grad()
-    def _partly_imagined(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """Observations (B, T, S), a share of them replaced by what the model predicts from the true past.
-
-        Scheduled sampling (Bengio et al. 2015) for all tokens at once (Mihaylova and Martins 2019).
-        """
-        imagined = self._one_step_ahead(self(observations, actions)[0], observations)
-        chosen = torch.rand(imagined.shape[:-1], device=imagined.device) < self.options.scheduled_sampling
-        return torch.where(chosen[..., None], imagined, observations)
 
     @torch.no_grad()
     def fit_epistemic(self, batches: Iterable[dict[str, Tensor]], *, generator: torch.Generator) -> None:
