@@ -10,6 +10,7 @@ from walker import walker_dataset
 
 from envtf_lit.errors import UserError
 from envtf_lit.world_models.attention import LARGE_CACHE, Attention, rotate, rotation
+from envtf_lit.world_models.finetuning import start_from
 from envtf_lit.world_models.interface import Prediction
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 from envtf_lit.world_models.options import ModelOptions
@@ -315,7 +316,7 @@ def test_a_model_that_starts_from_another_predicts_as_it_did_whatever_its_own_sc
     base = scaled(EnvironmentTransformer(3, 2, **SMALL, epistemic=epistemic), 1)
     mine = scaled(EnvironmentTransformer(3, 2, **SMALL, epistemic=epistemic), 2)
     before = {name: buffer.clone() for name, buffer in mine.normaliser.named_buffers()}
-    mine.start_from(base)
+    start_from(mine, base)
     assert all(torch.equal(buffer, before[name]) for name, buffer in mine.normaliser.named_buffers())
     observations, actions = torch.randn(4, 5, 3), torch.randn(4, 5, 2)
     outcomes, deviations = [], []
@@ -334,7 +335,7 @@ def test_the_blocks_are_kept_and_projections_of_other_dimensions_begin_anew(S, A
     torch.manual_seed(0)
     base, mine = EnvironmentTransformer(3, 2, **SMALL), EnvironmentTransformer(S, A, **SMALL)
     fresh = {name: value.clone() for name, value in mine.state_dict().items()}
-    mine.start_from(base)
+    start_from(mine, base)
     theirs = base.state_dict()
     for name, value in mine.named_parameters():
         taken_over = name.split(".")[0] in {"blocks", "norm"} | kept
@@ -344,7 +345,7 @@ def test_the_blocks_are_kept_and_projections_of_other_dimensions_begin_anew(S, A
 def test_what_the_weights_mean_cannot_change():
     base = EnvironmentTransformer(3, 2, **SMALL)
     with pytest.raises(UserError, match="target is delta there and absolute here"):
-        EnvironmentTransformer(3, 2, **SMALL, target="absolute").start_from(base)
+        start_from(EnvironmentTransformer(3, 2, **SMALL, target="absolute"), base)
 
 
 def test_bounded_predictions_never_leave_the_range_of_the_data():

@@ -132,17 +132,6 @@ class EnsembleDynamics(nn.Module):
         target = self.normaliser.target(observations, following, rewards)
         return mean, log_variance, target, batch["mask"].flatten(-2, -1)[..., None]
 
-    def start_from(self, other: "EnsembleDynamics") -> None:
-        """Takes over another ensemble of the same dimensions whole, its normaliser too.
-
-        Raises:
-            UserError: the two differ in dimensions, members or layers.
-        """
-        for name, theirs in other.arguments.items():
-            if self.arguments[name] != theirs:
-                raise UserError(f"{name} is {theirs} there and {self.arguments[name]} here; leave it as it is there.")
-        self.load_state_dict(other.state_dict())
-
     def adopt(self, other: "EnsembleDynamics", members: Tensor) -> None:
         """Takes over the weights of those members (M,) bool of an ensemble of the same shape."""
         with torch.no_grad():

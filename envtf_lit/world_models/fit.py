@@ -80,11 +80,11 @@ def publish_world_model(
 
     lit.fit_uncertainty(data)
     names = {"epoch": "epoch", "open_loop_error": "val/open_loop_error", "val_loss": "val/loss"}
-    metrics: dict[str, Any] = {"parameters": sum(p.numel() for p in lit.kept.parameters())}
+    metrics: dict[str, Any] = {"parameters": sum(p.numel() for p in lit.best_model.parameters())}
     metrics |= {name: best[column] for name, column in names.items() if column in best}
     head = learn_termination(data.train, seed=lit.seed) if data.dataset.task is None else None
     with replacing(target) as folder:
-        save_world_model(folder, lit.kept)
+        save_world_model(folder, lit.best_model)
         if head is not None:
             save_termination(folder / TERMINATION, head)
             metrics |= head.scores(data.held_out)
