@@ -136,8 +136,8 @@ class Clock(Callback):
         self.paused = time.perf_counter()
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        taught = forecast(pl_module.best_model, self.stretches, feedback="recorded")  # pyright: ignore[reportArgumentType]
-        error = nmse(taught.mean, self.stretches, self.scale)[self.stretches.valid].mean()
+        teacher_forced = forecast(pl_module.best_model, self.stretches, feedback="recorded")  # pyright: ignore[reportArgumentType]
+        error = nmse(teacher_forced.mean, self.stretches, self.scale)[self.stretches.valid].mean()
         self.curve.append((round(self.paused - self.begin - self.pauses, 1), float(error)))
         self.pauses += time.perf_counter() - self.paused
 

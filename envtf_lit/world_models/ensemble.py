@@ -26,7 +26,7 @@ BOUND_WEIGHT = 0.01  # of the term that draws the bounds together
 
 @dataclass(frozen=True)
 class EnsembleState:
-    """A batch of rollouts under way; the members remember nothing.
+    """State of a batch of B rollouts; the members remember nothing.
 
     Attributes:
         observation: (B, S) current observation.
@@ -40,7 +40,7 @@ class EnsembleState:
 
 
 class EnsembleDynamics(nn.Module):
-    """Predicts the next state and reward from the current state and action alone.
+    """World model without memory: predicts next state and reward from the current state and action alone.
 
     Mean and aleatoric variance are the elites' means of both. Epistemic variance is that of all members' means: where
     data were lacking the worse ones disagree as well as the better ones. One member alone has no such estimate.

@@ -1,4 +1,4 @@
-"""Forecasts along recorded episodes, on the model's own predictions or teacher-forced, and their errors."""
+"""Open-loop and teacher-forced forecasts of a world model along recorded episodes, and their errors."""
 
 from dataclasses import dataclass
 from typing import Literal

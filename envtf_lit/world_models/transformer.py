@@ -25,7 +25,7 @@ from envtf_lit.world_models.normaliser import Normaliser
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 from envtf_lit.world_models.options import ModelOptions
 from envtf_lit.world_models.uncertainty.laplace import LastLayerLaplace, RandomFeatures, clusters
-from envtf_lit.world_models.uncertainty.recalibration import fitted, normal_scores
+from envtf_lit.world_models.uncertainty.recalibration import fitted_factor_and_tail, normal_scores
 from envtf_lit.world_models.uncertainty.tails import log_density, stretch
 
 LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -14.0, 4.0
@@ -298,7 +298,9 @@ class EnvironmentTransformer(nn.Module):
         self.recalibration.fill_(1.0)
         self.tail.zero_()
         trajectories = trajectories.to(self.recalibration.device)
-        factor, tail = fitted(normal_scores(forecast(self, trajectories, feedback="recorded"), trajectories))
+        factor, tail = fitted_factor_and_tail(
+            normal_scores(forecast(self, trajectories, feedback="recorded"), trajectories)
+        )
         self.recalibration.copy_(factor)
         self.tail.copy_(tail)
 
