@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -169,7 +169,7 @@ class RandomPolicy:
         return self.action_low + uniform * (self.action_high - self.action_low)
 
 
-POLICIES: dict[str, type[nn.Module]] = {"tanh_gaussian": TanhGaussianActor}
+POLICIES = {"tanh_gaussian": TanhGaussianActor}
 
 
 def save_policy(folder: str | Path, actor: TanhGaussianActor) -> None:
@@ -177,10 +177,18 @@ def save_policy(folder: str | Path, actor: TanhGaussianActor) -> None:
     save_module(folder, actor, kind="tanh_gaussian", arguments=actor.arguments)
 
 
-def load_policy(folder: str | Path) -> Any:
+def load_policy(folder: str | Path) -> TanhGaussianActor:
     """The policy saved in a folder, ready to `act`.
 
     Raises:
-        UserError: the folder is missing, damaged, or holds something that is not a policy.
+        UserError: the folder is missing, damaged, or holds something that is not a policy, or one whose action limits
+            are no finite range.
     """
-    return load_module(folder, POLICIES)
+    actor = load_module(folder, POLICIES)
+    width = actor.action_high - actor.action_low
+    if not ((width > 0) & width.isfinite()).all():
+        raise UserError(
+            f"{folder} holds action limits {actor.action_low.tolist()} and {actor.action_high.tolist()}: each low one "
+            "must be less than its high one, and both finite; train the policy on data that say so."
+        )
+    return actor

@@ -300,14 +300,14 @@ def test_members_are_kept_at_their_best_and_the_best_are_elites():
     for error in ([0.5, 0.3, 0.9], [0.6, 0.299, 0.2], [0.4, 0.1, 0.5]):
         for weight in lit.model.parameters():
             weight.data.fill_(len(history))
-        lit._keep_the_best(torch.tensor(error))
+        lit._update_best(torch.tensor(error))
         history.append((lit.best.biases[0][:, 0, 0].tolist(), lit.best.elite.tolist(), int(lit.stale)))
     assert history == [
         ([0.0, 0.0, 0.0], [1, 0], 0),
         ([0.0, 0.0, 1.0], [2, 1], 0),  # by 0.3 % is not an improvement
         ([2.0, 2.0, 1.0], [1, 2], 0),
     ]
-    lit._keep_the_best(torch.tensor([0.4, 0.1, 0.2]))
+    lit._update_best(torch.tensor([0.4, 0.1, 0.2]))
     assert int(lit.stale) == 1
 
 

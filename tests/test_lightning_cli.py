@@ -230,7 +230,7 @@ def test_another_robots_policy_keeps_the_frozen_hidden_layers(folder: Path) -> N
     [
         ("model", {"updates": 5}, "model.options.updates is 5: take a multiple of its updates_per_epoch (2)"),
         ("model", {"updates_per_epoch": 0}, "model.options.updates_per_epoch is 0, expected an integer, 1 or more"),
-        ("model", {"model.multi_step": 0}, "model.options.model.multi_step is 0, expected an integer, 1 or more"),
+        ("model", {"model.context": 0}, "model.options.model.context is 0, expected an integer, 1 or more"),
         ("model", {"model.width": 6}, "model.options.model.width is 6 and heads is 2"),
         ("model", {"ensemble": '{"hidden": [8]}'}, "model.options.ensemble.weight_decay has 5 entries and there are 2"),
         ("model", {"ensemble": '{"members": 0}'}, "model.options.ensemble.members is 0, expected an integer, 1"),

@@ -81,9 +81,11 @@ def noisy_episodes(model: EnvironmentTransformer) -> Trajectories:
     """What happens differs from what the model predicts by three of its standard deviations, with heavy tails."""
     observations, actions = sequences(8, 30)
     empty = Trajectories(observations, actions, torch.zeros(8, 30, S + 1), torch.tensor([30, 30, 30, 30, 20, 20, 9, 9]))
-    taught = forecast(model, empty, feedback="recorded")
-    noise = stretch(torch.randn(taught.mean.shape, generator=torch.Generator().manual_seed(5)), torch.tensor(0.3))
-    return Trajectories(observations, actions, taught.mean + 3 * taught.std * noise, empty.lengths)
+    teacher_forced = forecast(model, empty, feedback="recorded")
+    noise = stretch(
+        torch.randn(teacher_forced.mean.shape, generator=torch.Generator().manual_seed(5)), torch.tensor(0.3)
+    )
+    return Trajectories(observations, actions, teacher_forced.mean + 3 * teacher_forced.std * noise, empty.lengths)
 
 
 @pytest.mark.parametrize("epistemic", ["laplace", "none", "head"])

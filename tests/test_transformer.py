@@ -10,6 +10,7 @@ from walker import walker_dataset
 
 from envtf_lit.errors import UserError
 from envtf_lit.world_models.attention import LARGE_CACHE, Attention, rotate, rotation
+from envtf_lit.world_models.finetuning import start_from
 from envtf_lit.world_models.interface import Prediction
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 from envtf_lit.world_models.options import ModelOptions
@@ -315,7 +316,7 @@ def test_a_model_that_starts_from_another_predicts_as_it_did_whatever_its_own_sc
     base = scaled(EnvironmentTransformer(3, 2, **SMALL, epistemic=epistemic), 1)
     mine = scaled(EnvironmentTransformer(3, 2, **SMALL, epistemic=epistemic), 2)
     before = {name: buffer.clone() for name, buffer in mine.normaliser.named_buffers()}
-    mine.start_from(base)
+    start_from(mine, base)
     assert all(torch.equal(buffer, before[name]) for name, buffer in mine.normaliser.named_buffers())
     observations, actions = torch.randn(4, 5, 3), torch.randn(4, 5, 2)
     outcomes, deviations = [], []
@@ -334,7 +335,7 @@ def test_the_blocks_are_kept_and_projections_of_other_dimensions_begin_anew(S, A
     torch.manual_seed(0)
     base, mine = EnvironmentTransformer(3, 2, **SMALL), EnvironmentTransformer(S, A, **SMALL)
     fresh = {name: value.clone() for name, value in mine.state_dict().items()}
-    mine.start_from(base)
+    start_from(mine, base)
     theirs = base.state_dict()
     for name, value in mine.named_parameters():
         taken_over = name.split(".")[0] in {"blocks", "norm"} | kept
@@ -344,7 +345,7 @@ def test_the_blocks_are_kept_and_projections_of_other_dimensions_begin_anew(S, A
 def test_what_the_weights_mean_cannot_change():
     base = EnvironmentTransformer(3, 2, **SMALL)
     with pytest.raises(UserError, match="target is delta there and absolute here"):
-        EnvironmentTransformer(3, 2, **SMALL, target="absolute").start_from(base)
+        start_from(EnvironmentTransformer(3, 2, **SMALL, target="absolute"), base)
 
 
 def test_bounded_predictions_never_leave_the_range_of_the_data():
@@ -370,61 +371,13 @@ def test_bounded_predictions_never_leave_the_range_of_the_data():
     assert bool(((wild[True] >= low - 1e-5) & (wild[True] <= high + 1e-5)).all())
 
 
-def test_scheduled_sampling_shows_the_model_its_own_predictions_in_training_alone():
-    observations, actions = sequences(50, 6)
-    batch = dict(observations=observations, actions=actions, next_observations=observations.roll(-1, 1))
-    batch |= dict(rewards=torch.zeros(50, 6), mask=torch.ones(50, 6))
-    plain, sampling = make_model().train(), make_model(scheduled_sampling=0.3)
-    torch.testing.assert_close(sampling.eval().loss(batch), plain.loss(batch), rtol=0, atol=0)
-    assert sampling.train().loss(batch) != plain.loss(batch)
-    with torch.no_grad():
-        mean, _, _ = sampling(observations, actions)
-        predicted = sampling.normaliser.outcome(observations, mean)[:, :-1, :S]
-        mixed = sampling._partly_imagined(observations, actions)
-    assert torch.equal(mixed[:, 0], observations[:, 0])
-    own = (mixed[:, 1:] != observations[:, 1:]).any(-1)
-    torch.testing.assert_close(mixed[:, 1:][own], predicted[own])
-    assert 0.2 < own.double().mean() < 0.4
-
-
-def test_without_scheduled_sampling_nothing_is_drawn():
+def test_without_dropout_the_loss_draws_nothing():
     observations, actions = sequences(2, 6)
     batch = dict(observations=observations, actions=actions, next_observations=observations)
     batch |= dict(rewards=torch.zeros(2, 6), mask=torch.ones(2, 6))
     model, before = make_model().train(), torch.get_rng_state()
     model.loss(batch)
     assert torch.equal(torch.get_rng_state(), before)
-
-
-def window_batch(rows=3, length=8):
-    observations, actions = sequences(rows, length + 1)
-    return {
-        "observations": observations[:, :-1],
-        "actions": actions[:, :-1],
-        "next_observations": observations[:, 1:],
-        "rewards": observations[:, 1:, 0],
-        "mask": torch.ones(rows, length),
-    }
-
-
-def test_multi_step_learns_from_its_own_predictions_with_gradients_through_them():
-    batch = window_batch()
-    model = make_model(multi_step=2).train()
-    with torch.no_grad():
-        model.head.bias.normal_()
-    mean, _, _ = model(batch["observations"], batch["actions"])
-    imagined = model.normaliser.outcome(batch["observations"], mean)[:, :-1, :-1]
-    second = batch | {"observations": torch.cat([batch["observations"][:, :1], imagined], 1)}
-    one = make_model().train()
-    one.load_state_dict(model.state_dict())
-    torch.testing.assert_close(model.loss(batch), (one.loss(batch) + one.loss(second)) / 2)
-    through, apart = [
-        torch.autograd.grad(one.loss(batch | {"observations": x}), one.head.bias)[0]
-        for x in (second["observations"].detach(), batch["observations"])
-    ]
-    (gradient,) = torch.autograd.grad(model.loss(batch), model.head.bias)
-    assert not torch.allclose(gradient, (through + apart) / 2)  # some of it came through the predictions
-    assert model.eval().loss(batch) == one.eval().loss(batch)
 
 
 def test_fused_steps_equal_plain_ones(monkeypatch: pytest.MonkeyPatch):
@@ -444,16 +397,3 @@ def test_fused_steps_equal_plain_ones(monkeypatch: pytest.MonkeyPatch):
             if step == 4:  # rollouts end, and fewer go on
                 states[number] = model.gather(states[number], torch.tensor([0, 3]))
         torch.testing.assert_close(states[1].observation, states[0].observation)
-
-
-def test_any_step_hides_states_behind_the_last_one_shown():
-    model = make_model(any_step=0.9)
-    observations = torch.arange(64.0)[None, :, None].expand(200, 64, S)
-    torch.manual_seed(0)
-    seen = model._partly_hidden(observations)[..., 0]
-    changed = seen != observations[..., 0]
-    assert not changed[:, 0].any()
-    step = seen.diff(dim=1)
-    assert ((step == 0) == changed[:, 1:]).all()  # a hidden state repeats the one before; a shown one is itself
-    share = changed[:, 1:].float().mean(1)
-    assert share.mean() == pytest.approx(0.45, abs=0.05) and share.min() < 0.1 and 0.75 < share.max() < 1.0

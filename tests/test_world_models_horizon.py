@@ -108,10 +108,10 @@ def test_selection_prefers_the_better_model_and_is_finite_for_all():
 def test_an_open_loop_after_history_is_taught_first_and_then_on_its_own():
     data, model = linear_data((20, 20), noise=0.01), linear_world(error=0.03)
     trajectories = whole_episodes(data, 2, seed=0)
-    taught = forecast(model, trajectories, feedback="recorded").mean
+    teacher_forced = forecast(model, trajectories, feedback="recorded").mean
     warm, cold = (forecast(model, trajectories, feedback="imagined", history=history).mean for history in (7, 0))
-    assert torch.equal(warm[:, :8], taught[:, :8])  # the step from the true state 7 is the first of its own
-    assert not torch.equal(warm[:, 8:], taught[:, 8:])
+    assert torch.equal(warm[:, :8], teacher_forced[:, :8])  # the step from the true state 7 is the first of its own
+    assert not torch.equal(warm[:, 8:], teacher_forced[:, 8:])
     late = segments(data, 1, 13, seed=0, whole=True)  # memory is none of this model's: only where it starts counts
     begin = data.episode_starts + 7
     for episode, row in enumerate(begin):

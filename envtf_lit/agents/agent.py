@@ -37,7 +37,7 @@ class Part:
     betas: tuple[float, float] = (0.9, 0.999)
 
 
-class Phase(ABC):
+class Phase:
     """A stretch of an agent's training in which every update does the same.
 
     Attributes:
@@ -46,9 +46,9 @@ class Phase(ABC):
 
     updates: int
 
-    @abstractmethod
     def update(self, agent: "Agent", batch: Batch, done: int) -> Logs:
         """One gradient step of every part that learns in this phase, after `done` others; returns what to log."""
+        raise NotImplementedError
 
     def begin_epoch(self, agent: "Agent") -> None:
         """Called at the start of each epoch: what it carries on from update to update must not outlive one."""

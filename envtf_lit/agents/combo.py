@@ -29,7 +29,6 @@ class ImaginingOptions(CQLOptions):
     rollouts: RolloutOptions = field(default_factory=RolloutOptions)
 
 
-
 class COMBO(CQL):
     """Conservative Q-Learning on a mixture of real and imagined rows, in COMBO's form."""
 

@@ -11,6 +11,7 @@ from envtf_lit.agents.agent import Batch, Logs
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.sac import SAC, SACOptions
 from envtf_lit.options.numbers import Count, NonNegative
+from envtf_lit.options.schema import rare
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class CQLOptions(SACOptions):
     """
 
     cql_weight: NonNegative = 0.1
-    sampled_actions: Count = 2
+    sampled_actions: Count = rare(2)
 
 
 class CQL(SAC):

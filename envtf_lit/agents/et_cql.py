@@ -20,7 +20,17 @@ from envtf_lit.agents.value_gradient import (
 from envtf_lit.agents.warm_start import WarmStart
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.options import RolloutOptions
-from envtf_lit.options.numbers import Natural, NonzeroShare
+from envtf_lit.options.numbers import Count, Natural, NonNegative, NonzeroShare, Positive
+
+
+@dataclass(frozen=True)
+class PaperRolloutOptions(RolloutOptions):
+    """The paper's rollouts: five steps, each learned from, whatever the model knows of its errors."""
+
+    horizon: Count = 5
+    value_expansion: Natural = 0
+    posterior: NonNegative = 0.0
+    novelty_limit: Positive | None = None
 
 
 @dataclass(frozen=True)
@@ -29,11 +39,7 @@ class ETCQLPaperOptions(ImaginingOptions):
 
     real_ratio: NonzeroShare = 0.5
     refresh_every: Natural = 0
-    rollouts: RolloutOptions = field(
-        default_factory=lambda: RolloutOptions(
-            horizon=5, value_expansion=0, multi_step=False, posterior=0.0, novelty_limit=None
-        )
-    )
+    rollouts: PaperRolloutOptions = field(default_factory=PaperRolloutOptions)
 
 
 class ETCQLPaper(CQL):

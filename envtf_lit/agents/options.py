@@ -5,8 +5,8 @@ from typing import Literal
 
 from envtf_lit.data.loaders import UPDATES_PER_STEP
 from envtf_lit.errors import UserError
-from envtf_lit.options.numbers import Count, Natural, NonzeroShare, Positive, Share
-from envtf_lit.options.schema import check_epochs
+from envtf_lit.options.numbers import Count, NonzeroShare, Positive, Share
+from envtf_lit.options.schema import check_epochs, rare
 
 NO_WORLD_MODEL = "none"
 
@@ -40,14 +40,14 @@ class CommonOptions:
     updates_per_epoch: Count = 500
     batch_size: Count = 256
     hidden: tuple[Count, ...] = (256, 256)
-    layer_norm: bool = True
+    layer_norm: bool = rare(True)
     discount: Share = 0.997
     normalise_returns: bool = True
     return_temperature: Positive | None = 0.1
     n_step: Count = 20
-    target_rate: NonzeroShare = 0.005
+    target_rate: NonzeroShare = rare(0.005)
     actor_learning_rate: Positive = 0.0003
-    actor_schedule: Literal["constant", "cosine"] = "cosine"
+    actor_schedule: Literal["constant", "cosine"] = rare("cosine")
     critic_learning_rate: Positive = 0.0003
     warm_start: Share = 0.3333
     actor_average: NonzeroShare = 0.002

@@ -1,4 +1,4 @@
-"""Soft Actor-Critic (Haarnoja et al. 2018): critics, their targets, a squashed Gaussian actor, a learned temperature."""
+"""Soft Actor-Critic (Haarnoja et al. 2018): critics and their targets, a Gaussian actor, a learned temperature."""
 
 import contextlib
 import copy
@@ -14,8 +14,9 @@ from envtf_lit.agents.agent import Agent, Batch, Logs, Losses, Part, Phase, foll
 from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.warm_start import WarmStart
-from envtf_lit.options.numbers import NonNegative, Positive
+from envtf_lit.options.numbers import NonNegative
 
+INITIAL_ALPHA = 0.01  # weight of the entropy in the actor's objective at the start; learned from there on
 CRITICS = 2  # of which targets and actor take the smallest
 
 
@@ -24,20 +25,18 @@ class SACOptions(PolicyOptions):
     """Soft Actor-Critic's own options.
 
     Attributes:
-        initial_alpha: weight of the entropy in the actor's objective at the start; learned from there on.
         clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log.
     """
 
-    initial_alpha: Positive = 0.01
     clone_weight: NonNegative = 0.25
 
 
 class Temperature(nn.Module):
     """`alpha`, the weight of the entropy, as its logarithm."""
 
-    def __init__(self, initial: float) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.log_alpha = nn.Parameter(torch.tensor(initial).log())
+        self.log_alpha = nn.Parameter(torch.tensor(INITIAL_ALPHA).log())
 
 
 class SAC(Agent):
@@ -53,7 +52,7 @@ class SAC(Agent):
             self.observation_dim, self.action_dim, n=CRITICS, hidden=o.hidden, layer_norm=o.layer_norm
         )
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.temperature = Temperature(o.initial_alpha)
+        self.temperature = Temperature()
 
     def build_phases(self) -> list[Phase]:
         warm = self.options.warm_updates

@@ -5,26 +5,25 @@ from pathlib import Path
 from typing import Any
 
 from envtf_lit.files import replacing
-from envtf_lit.policy import save_policy
-from envtf_lit.training import record_training
+from envtf_lit.policy import TanhGaussianActor, save_policy
+from envtf_lit.training import Curves, record_training
 
 
 def publish_policy(
-    target: Path, actor: Any, curves: Any, kept: Mapping[str, float], settings: dict[str, Any]
+    target: Path, actor: TanhGaussianActor, curves: Curves, kept: Mapping[str, float], settings: dict[str, Any]
 ) -> dict[str, Any]:
     """Writes a policy's folder.
 
     Args:
         target: folder of the weights, metrics, curves and resolved options.
-        actor: the `TanhGaussianActor` to keep.
-        curves: the `Curves` of the training.
+        actor: to keep.
+        curves: of the training.
         kept: the row of them that belongs to the actor.
         settings: the resolved options.
 
     Returns:
         The row, its columns named without their split.
     """
-
     metrics = {name.rpartition("/")[2]: value for name, value in kept.items()}
     with replacing(target) as folder:
         save_policy(folder, actor)

@@ -14,6 +14,7 @@ from envtf_lit.imagination.buffer import Imagination
 from envtf_lit.imagination.histories import Histories
 from envtf_lit.imagination.rollouts import Rollouts, gather_steps
 from envtf_lit.options.numbers import Count, NonNegative, NonzeroShare, Positive
+from envtf_lit.options.schema import rare
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.world_models.unroll import Step, unroll
 
@@ -46,7 +47,7 @@ class ValueGradientOptions:
     horizon: Count = 16
     learning_rate: Positive = 0.001
     clone_weight: NonNegative = 0.05
-    actor_average: NonzeroShare = 0.05
+    actor_average: NonzeroShare = rare(0.05)
 
 
 class StateValues(nn.Module):

@@ -23,7 +23,7 @@ from envtf_lit.policy import Policy
 from envtf_lit.world_models.forecast import Forecast, Scale, Trajectories
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.normaliser import CONSTANT
-from envtf_lit.world_models.uncertainty.recalibration import fitted, normal_scores
+from envtf_lit.world_models.uncertainty.recalibration import fitted_factor_and_tail, normal_scores
 from envtf_lit.world_models.uncertainty.tails import crps, half_width, log_density
 
 FIRST_STEPS = 10  # of an episode: just after a reset robots are where they hardly ever are again
@@ -44,31 +44,31 @@ class Coverage:
     by_dimension: tuple[float | None, ...]
 
 
-def coverage(taught: Forecast, trajectories: Trajectories, scale: Scale, level: float) -> Coverage:
+def coverage(teacher_forced: Forecast, trajectories: Trajectories, scale: Scale, level: float) -> Coverage:
     """Share of recorded outcomes inside the central `level` interval of each one-step prediction.
 
     Args:
-        taught: the teacher-forced forecast of `horizon_report`.
+        teacher_forced: forecast of `horizon_report`.
         trajectories: what was forecast.
         scale: says which dimensions are live.
         level: in (0, 1).
     """
-    share = (normal_scores(taught, trajectories).abs() <= half_width(level)).double().mean(0)  # (S + 1,)
+    share = (normal_scores(teacher_forced, trajectories).abs() <= half_width(level)).double().mean(0)  # (S + 1,)
     live = scale.live.tolist()
     by_dimension = tuple(value if alive else None for value, alive in zip(share.tolist(), live, strict=True))
     return Coverage(level, float(share[scale.live].mean()), by_dimension)
 
 
-def recalibrated(taught: Forecast, seen: Forecast, trajectories: Trajectories) -> Forecast:
+def recalibrated(teacher_forced: Forecast, seen: Forecast, trajectories: Trajectories) -> Forecast:
     """A forecast with factors and tails that were fitted to another one of the same model, as the transformer has them.
 
     Args:
-        taught: what is to be recalibrated.
+        teacher_forced: what is to be recalibrated.
         seen: what factors and tails are fitted to, of other episodes.
         trajectories: what happened in these.
     """
-    factor, tail = fitted(normal_scores(replace(seen, tail=None), trajectories))
-    return Forecast(taught.mean, taught.std * factor.sqrt().to(taught.std.dtype), tail)
+    factor, tail = fitted_factor_and_tail(normal_scores(replace(seen, tail=None), trajectories))
+    return Forecast(teacher_forced.mean, teacher_forced.std * factor.sqrt().to(teacher_forced.std.dtype), tail)
 
 
 @dataclass(frozen=True)
@@ -84,19 +84,19 @@ class ProperScores:
     crps: float
 
 
-def proper_scores(taught: Forecast, trajectories: Trajectories, scale: Scale) -> ProperScores:
+def proper_scores(teacher_forced: Forecast, trajectories: Trajectories, scale: Scale) -> ProperScores:
     """Scores of one-step predictions at the recorded outcomes, mean over live dimensions and the reward.
 
     Args:
-        taught: the teacher-forced forecast of `horizon_report`; a spread below 1e-6 z-scored units counts as that.
+        teacher_forced: forecast of `horizon_report`; a spread below 1e-6 z-scored units counts as that.
         trajectories: what was forecast.
         scale: the units, and which dimensions are live.
     """
-    columns = (trajectories.targets - taught.mean, taught.std)
+    columns = (trajectories.targets - teacher_forced.mean, teacher_forced.std)
     error, std = ((column[trajectories.valid] / scale.std)[:, scale.live].double() for column in columns)
     std = std.clamp(min=CONSTANT)
     z = error.nan_to_num(nan=math.inf) / std
-    tail = torch.zeros_like(scale.std) if taught.tail is None else taught.tail
+    tail = torch.zeros_like(scale.std) if teacher_forced.tail is None else teacher_forced.tail
     tail = tail[scale.live].double()
     scores = std.log() - log_density(z, tail), std * crps(z, tail)
     return ProperScores(*(min(float(score.mean()), LARGEST) for score in scores))

@@ -47,9 +47,9 @@ def stretches(dataset: OfflineDataset, count: int, *, seed: int) -> Trajectories
 
 def recognition(model: WorldModel, trajectories: Trajectories, scale: Scale) -> Recognition:
     """Measures a model on what `stretches` gives, on the same device."""
-    taught = forecast(model, trajectories, feedback="recorded")
+    teacher_forced = forecast(model, trajectories, feedback="recorded")
     free = forecast(model, trajectories, feedback="imagined", history=HISTORY)
-    one_step, open_loop = (nmse(run.mean, trajectories, scale) for run in (taught, free))
+    one_step, open_loop = (nmse(run.mean, trajectories, scale) for run in (teacher_forced, free))
     return Recognition.of(one_step[:, :CONTEXT], open_loop[:, HISTORY : HISTORY + HORIZON])
 
 

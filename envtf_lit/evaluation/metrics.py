@@ -37,7 +37,9 @@ def world_model_metrics(report: HorizonReport, scale: Scale, *, parameters: int)
         scale: the training data's units.
         parameters: number of trainable parameters of the model.
     """
-    covered = {level: coverage(report.taught, report.trajectories, scale, level).mean for level in (0.5, 0.9)}
+    covered = {
+        level: coverage(report.teacher_forced_forecast, report.trajectories, scale, level).mean for level in (0.5, 0.9)
+    }
     return {
         "parameters": parameters,
         "nmse_one_step": report.nmse_one_step,
@@ -49,8 +51,15 @@ def world_model_metrics(report: HorizonReport, scale: Scale, *, parameters: int)
 
 
 def collect_metrics(
-    returns: Mapping[str, Returns], *, task: str, seed: int, dataset: OfflineDataset, source: str, robot: Robot,
-    labels: Mapping[str, str], **facts: Any
+    returns: Mapping[str, Returns],
+    *,
+    task: str,
+    seed: int,
+    dataset: OfflineDataset,
+    source: str,
+    robot: Robot,
+    labels: Mapping[str, str],
+    **facts: Any,
 ) -> dict[str, Any]:
     """What `reports/metrics.json` holds; standard deviations are over episodes, with n in the denominator.
 
@@ -67,7 +76,10 @@ def collect_metrics(
     unit, episodes = comparable(dataset, returns, robot, source)
     recorded = episodes["data"]
     policies = {
-        name: {"label": labels[name]} | _spread(unit, episodes[name]) | _spread("return", found.returns) | {"episodes": len(found.returns)}
+        name: {"label": labels[name]}
+        | _spread(unit, episodes[name])
+        | _spread("return", found.returns)
+        | {"episodes": len(found.returns)}
         for name, found in returns.items()
     }
     known = {f"{unit}_mean": float(recorded.mean()), f"{unit}_max": float(recorded.max())}

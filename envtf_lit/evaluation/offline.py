@@ -64,12 +64,14 @@ def evaluate_offline(
         training: gives the range of rewards and the spread of actions.
     """
     held_out = report.trajectories
-    imagined = (_bounded(report.imagined.mean[..., -1], training) * held_out.valid).sum(1)
+    imagined = (_bounded(report.open_loop_forecast.mean[..., -1], training) * held_out.valid).sum(1)
     return OfflineEstimates(
         recorded=held_out.targets[..., -1].double().sum(1).cpu().numpy(),
         imagined=imagined.cpu().numpy(),
         policies={
-            name: OfflineEstimate(imagined_returns(model, policy, held_out, training), action_error(policy, held_out, training))
+            name: OfflineEstimate(
+                imagined_returns(model, policy, held_out, training), action_error(policy, held_out, training)
+            )
             for name, policy in policies.items()
         },
     )
@@ -85,7 +87,9 @@ def imagined_returns(model: WorldModel, policy: Policy, held_out: Trajectories, 
     first, no_actions = held_out.observations[:, :1], held_out.actions[:, :0]
     state = model.init(first, no_actions, torch.ones_like(held_out.lengths))
     total = torch.zeros(len(first), dtype=torch.float64, device=first.device)
-    for step in unroll(model, state, lambda t, rows, observation: policy.act(observation, True), held_out.valid.shape[1]):
+    for step in unroll(
+        model, state, lambda t, rows, observation: policy.act(observation, True), held_out.valid.shape[1]
+    ):
         recorded = held_out.valid[:, step.index]  # (B,) whose episode still lasted
         total += torch.where(recorded, _bounded(step.prediction.reward, training), 0.0)
     return total.cpu().numpy()

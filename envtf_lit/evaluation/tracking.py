@@ -76,18 +76,18 @@ def track(
         terminated: the robot's rule, of next observations (..., S).
     """
     report, lengths = horizon_report(model, trajectories, scale), trajectories.lengths
-    taught = report.teacher_forced_nmse
+    teacher_forced = report.teacher_forced_nmse
     numbers = {
         "trajectories": len(lengths),
         "mean_length": float(lengths.double().mean()),
         "one_step_nrmse": math.sqrt(min(report.nmse_one_step, LARGEST)),
-        "one_step_typical": math.sqrt(min(float(taught[trajectories.valid].median()), LARGEST)),
-        **_explosions(report.open_loop_nmse, trajectories, report.imagined.mean, terminated),
+        "one_step_typical": math.sqrt(min(float(teacher_forced[trajectories.valid].median()), LARGEST)),
+        **_explosions(report.open_loop_nmse, trajectories, report.open_loop_forecast.mean, terminated),
         **_numbers("open_loop", report.open_loop),
         **_numbers("teacher_forced", report.teacher_forced),
         **{f"open_loop_nmse_at_{h}": min(value, LARGEST) for h, value in report.median_nmse.items()},
     }
-    errors = {"open_loop": report.open_loop_nmse, "teacher_forced": taught}
+    errors = {"open_loop": report.open_loop_nmse, "teacher_forced": teacher_forced}
     return Tracking(numbers, {run: _curve(error, lengths) for run, error in errors.items()})
 
 

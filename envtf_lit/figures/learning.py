@@ -78,9 +78,7 @@ def learning_curves(
     return Path(path)
 
 
-def _panel(
-    axis: Axes, lines: pd.DataFrame, quantity: str, labels: Mapping[str, str], runs: tuple[str, ...]
-) -> None:
+def _panel(axis: Axes, lines: pd.DataFrame, quantity: str, labels: Mapping[str, str], runs: tuple[str, ...]) -> None:
     single, colours = len(runs) == 1, policy_colours(runs)
     for run, split in dict.fromkeys(zip(lines["run"], lines["split"], strict=True)):
         line = lines[(lines["run"] == run) & (lines["split"] == split)]

@@ -21,7 +21,7 @@ COLOURS = {
     "data": "#8c8c8c",
     "recorded": "#333333",
     "imagined": "#D55E00",
-    "taught": "#56B4E9",
+    "teacher_forced": "#56B4E9",
     "threshold": "#999999",
     "transformer": "#D55E00",
     "context_1": "#56B4E9",

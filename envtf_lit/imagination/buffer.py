@@ -1,4 +1,4 @@
-"""Batches of real and imagined rows: rollouts of the current policy, the newest kept in a ring, mixed into the log's."""
+"""Batches of real and imagined rows: rollouts of the current policy, the newest kept in a ring."""
 
 import torch
 from torch import Tensor, nn
@@ -150,7 +150,7 @@ class ImaginedBatches(nn.Module):
         o = self.imagination.options
         rewards = rollouts.rewards - o.penalty * self.imagination.reward_std * rollouts.uncertainty
         rewards = rewards / self.reward_scale
-        if o.multi_step:
+        if o.value_expansion > 0:
             total, end, weight = rollouts.returns(rewards, self.discount)
         else:
             weight = self.discount * (~rollouts.terminated).float()

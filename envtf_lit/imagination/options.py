@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from envtf_lit.options.numbers import Count, Natural, NonNegative, Positive
+from envtf_lit.options.schema import rare
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class GenerateRolloutsOptions:
     branches: Count = 4_500
     horizon: Count = 5
     history: Natural = 4
-    exploration: NonNegative = 0.1
+    exploration: NonNegative = rare(0.1)
     novelty_limit: Positive | None = 1.0
 
 
@@ -37,8 +38,8 @@ class RolloutOptions:
         branches: rollouts per round, each from a dataset state drawn as the real rows are.
         horizon: steps of each rollout, unless the robot falls first.
         value_expansion: deterministic steps after the horizon, which are not learned from but whose rewards, and end,
-            enter the targets of the steps before them (model-based value expansion, Feinberg et al. 2018).
-        multi_step: temporal-difference targets run to the end of the imagined rollout, not one step.
+            enter the targets of the steps before them (model-based value expansion, Feinberg et al. 2018); 0 learns
+            from single imagined steps.
         history: real steps given to the model before the branch point.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
         posterior: above zero each rollout runs in a world model of its own, drawn from the posterior of the last layer
@@ -51,9 +52,8 @@ class RolloutOptions:
     branches: Count = 1_500
     horizon: Count = 1
     value_expansion: Natural = 50
-    multi_step: bool = True
     history: Natural = 4
-    mode: Literal["mean", "sample"] = "sample"
+    mode: Literal["mean", "sample"] = rare("sample")
     posterior: NonNegative = 1.0
     penalty: NonNegative = 0.0
     novelty_limit: Positive | None = 1.0

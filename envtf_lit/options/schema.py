@@ -13,6 +13,11 @@ Precision = Literal["fp32", "bf16"]
 Options = TypeVar("Options")
 
 
+def rare(default: Any) -> Any:
+    """A dataclass field that few change: `params.yaml` names it only where it differs from this default."""
+    return dataclasses.field(default=default, metadata={"rare": True})
+
+
 def build(cls: type[Options], values: Any, section: str) -> Options:
     """One options class from a tree of plain values, types and ranges checked; what is absent takes its default.
 

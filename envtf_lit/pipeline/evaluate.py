@@ -43,7 +43,12 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
     are no scores: what the model estimates for the policies, and how they agree with held-out actions, is all. The
     video shows the last policy of `train_policy`.
     """
-    options, name, robot, source = params.evaluate, params.evaluate.world_model, robot_of(params), params.download.source
+    options, name, robot, source = (
+        params.evaluate,
+        params.evaluate.world_model,
+        robot_of(params),
+        params.download.source,
+    )
     with run_stage("evaluate", params, root):
         dataset, rollouts = load_dataset(root / DATASET), load_rollouts(rollouts_file(root, name))
         folder = root / WORLD_MODELS / name
@@ -77,7 +82,9 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
                 no_video(video)
             else:
                 returns = {
-                    policy: evaluate_policy(actor, robot, episodes=options.episodes, seed=params.seed, progress=progress)
+                    policy: evaluate_policy(
+                        actor, robot, episodes=options.episodes, seed=params.seed, progress=progress
+                    )
                     for policy, actor in policies.items()
                 }
                 metrics = collect_metrics(returns, task=str(params.task), source=source, robot=robot, **facts)

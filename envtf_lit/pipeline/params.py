@@ -182,7 +182,9 @@ def _check_policy(section: str, options: PolicyOptions, params: Params) -> None:
     model = options.world_model
     if not ALGORITHMS[algorithm].imagines:
         if model != NO_WORLD_MODEL:
-            raise UserError(f"{section}.world_model is {model}, and {algorithm} learns from data alone: set it to none.")
+            raise UserError(
+                f"{section}.world_model is {model}, and {algorithm} learns from data alone: set it to none."
+            )
         return
     if model == NO_WORLD_MODEL:
         raise UserError(

@@ -9,7 +9,7 @@ from envtf_lit.agents.store import publish_policy
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import UPDATES_PER_STEP, TransitionData, return_weights
 from envtf_lit.files import pick_device
-from envtf_lit.imagination.buffer import ImaginedBatches, Imagination
+from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.params import Params, algorithm_of, one_of
 from envtf_lit.pipeline.stage import (

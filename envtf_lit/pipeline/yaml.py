@@ -82,7 +82,10 @@ def dump_params(params: Params) -> dict[str, Any]:
 
 def params_yaml(params: Params) -> str:
     """All options as YAML text, each with its meaning beside it: what `envtf init` writes."""
-    head = "# Every option of every stage. Change a number, then `dvc repro`: only what depends on it runs again."
+    head = (
+        "# The options of every stage. Change a number, then `dvc repro`: only what depends on it runs again.\n"
+        "# Rarer ones stand in `envtf train_policy --help` (or another stage's), and can be written here, too."
+    )
     return "\n".join([head, *_yaml_lines(Params, dump_params(params), 0, set())]) + "\n"
 
 
@@ -170,7 +173,10 @@ def _overlay(below: Any, *above: Any) -> Any:
 
 def _yaml_lines(cls: Any, values: Mapping[str, Any], depth: int, explained: set[str]) -> Iterator[str]:
     """One line an option; an option that comes twice with the same meaning is explained once."""
+    rare = {field.name: field.default for field in dataclasses.fields(cls) if field.metadata.get("rare")}
     for name, value in values.items():
+        if name in rare and rare[name] == value:
+            continue
         nested = isinstance(value, Mapping)
         line = f"{'  ' * depth}{name}:" + ("" if nested else f" {_scalar(value)}")
         if depth == 0 and nested:
@@ -180,12 +186,18 @@ def _yaml_lines(cls: Any, values: Mapping[str, Any], depth: int, explained: set[
             continue
         if depth == 0 and name in NAMED:
             for below, section in value.items():
-                yield f"  {below}:"
-                yield f"    {NAMED[name]}: {section[NAMED[name]]}  # {' | '.join(KINDS if name == 'train_model' else ALGORITHMS)}"
-                rest = {key: item for key, item in section.items() if key != NAMED[name]}
-                yield from _yaml_lines(_section(None, below, section, name), rest, 2, explained)
+                yield from _named_lines(name, below, section, explained)
         else:
             yield from _yaml_lines(_section(cls, name, value, ""), value, depth + 1, explained)
+
+
+def _named_lines(stage: str, name: str, values: Mapping[str, Any], explained: set[str]) -> Iterator[str]:
+    """A named section: its tag with the choices, then its options."""
+    tag, choices = NAMED[stage], KINDS if stage == "train_model" else ALGORITHMS
+    yield f"  {name}:"
+    yield f"    {tag}: {values[tag]}  # {' | '.join(choices)}"
+    rest = {key: value for key, value in values.items() if key != tag}
+    yield from _yaml_lines(_section(None, name, values, stage), rest, 2, explained)
 
 
 def _commented(line: str, cls: Any, name: str, explained: set[str]) -> str:

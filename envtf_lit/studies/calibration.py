@@ -237,14 +237,16 @@ class Course:
 
     def intervals(self, model: WorldModel) -> Measured:
         """Coverage and proper scores on held-out episodes."""
-        taught = forecast(model, self.episodes, feedback="recorded")
-        covered = {round(100 * level): coverage(taught, self.episodes, self.scale, level).mean for level in LEVELS}
+        teacher_forced = forecast(model, self.episodes, feedback="recorded")
+        covered = {
+            round(100 * level): coverage(teacher_forced, self.episodes, self.scale, level).mean for level in LEVELS
+        }
         curve = {"nominal": [level / 100 for level in covered], "observed": list(covered.values())}
         numbers = {f"coverage_{level}": covered[level] for level in (50, 90)}
-        numbers |= asdict(proper_scores(taught, self.episodes, self.scale))
+        numbers |= asdict(proper_scores(teacher_forced, self.episodes, self.scale))
         if self.calibrating is not None:  # models that were not recalibrated are, all by the same rule
             seen = forecast(model, self.calibrating, feedback="recorded")
-            fitted = proper_scores(recalibrated(taught, seen, self.calibrating), self.episodes, self.scale)
+            fitted = proper_scores(recalibrated(teacher_forced, seen, self.calibrating), self.episodes, self.scale)
             numbers |= {f"fitted_{name}": value for name, value in asdict(fitted).items()}
         return numbers, {"coverage": curve}
 

@@ -112,7 +112,7 @@ def _trial(name: str, task: str, dataset: Path, root: Path, options: SuiteOption
         "curve": clock.curve,
         "seconds_in_all": clock.curve[-1][0],
         "best_error": min(error for _, error in clock.curve),
-        "parameters": sum(p.numel() for p in lit.kept.parameters()),
+        "parameters": sum(p.numel() for p in lit.best_model.parameters()),
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
     }
     if torch.accelerator.is_available():
@@ -141,8 +141,8 @@ class Clock(Callback):
         self.paused = time.perf_counter()
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        taught = forecast(pl_module.kept, self.stretches, feedback="recorded")  # pyright: ignore[reportArgumentType]
-        error = nmse(taught.mean, self.stretches, self.scale)[self.stretches.valid].mean()
+        teacher_forced = forecast(pl_module.best_model, self.stretches, feedback="recorded")  # pyright: ignore[reportArgumentType]
+        error = nmse(teacher_forced.mean, self.stretches, self.scale)[self.stretches.valid].mean()
         self.curve.append((round(self.paused - self.begin - self.pauses, 1), float(error)))
         self.pauses += time.perf_counter() - self.paused
 

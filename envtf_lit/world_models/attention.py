@@ -88,12 +88,6 @@ class Attention(nn.Module):
         return self.out(y.flatten(1))  # (B, D)
 
 
-def _cache_type(device: torch.device) -> torch.dtype:
-    """As matrix products give keys and values on an accelerator, whose memory full caches fill; elsewhere fp32."""
-    kept_short = device.type != "cpu" and torch.is_autocast_enabled(device.type)
-    return torch.get_autocast_dtype(device.type) if kept_short else torch.float32
-
-
 def _token_by_token(cache: Tensor) -> bool:
     return cache.device.type == "cpu" and cache.numel() > LARGE_CACHE
 
@@ -111,8 +105,8 @@ def _mixture(weight: Tensor, values: Tensor) -> Tensor:
         return (weight.unsqueeze(-1) * values).sum(0)
     first, *others = zip(weight.unsqueeze(-1).unbind(), values.unbind(), strict=True)
     y = first[0] * first[1]
-    for share, value in others:
-        y = y.addcmul_(share, value)
+    for w, value in others:
+        y = y.addcmul_(w, value)
     return y
 
 
@@ -158,10 +152,3 @@ def _write(cache: Tensor, token: Tensor, slot: int) -> Tensor:
         cache = cache.clone()
     cache[slot] = token
     return cache
-
-
-def _take(cache: Tensor, index: Tensor, filled: int) -> Tensor:
-    """These rows of a cache (C, B, H, d), of which the first so many slots are filled."""
-    taken = cache.new_empty(cache.shape[0], len(index), *cache.shape[2:])
-    taken[:filled] = cache[:filled, index]
-    return taken

@@ -26,7 +26,7 @@ BOUND_WEIGHT = 0.01  # of the term that draws the bounds together
 
 @dataclass(frozen=True)
 class EnsembleState:
-    """A batch of rollouts under way; the members remember nothing.
+    """State of a batch of B rollouts; the members remember nothing.
 
     Attributes:
         observation: (B, S) current observation.
@@ -40,7 +40,7 @@ class EnsembleState:
 
 
 class EnsembleDynamics(nn.Module):
-    """Predicts the next state and reward from the current state and action alone.
+    """World model without memory: predicts next state and reward from the current state and action alone.
 
     Mean and aleatoric variance are the elites' means of both. Epistemic variance is that of all members' means: where
     data were lacking the worse ones disagree as well as the better ones. One member alone has no such estimate.
@@ -131,17 +131,6 @@ class EnsembleDynamics(nn.Module):
         mean, log_variance = self(self.normaliser.token(observations, actions))
         target = self.normaliser.target(observations, following, rewards)
         return mean, log_variance, target, batch["mask"].flatten(-2, -1)[..., None]
-
-    def start_from(self, other: "EnsembleDynamics") -> None:
-        """Takes over another ensemble of the same dimensions whole, its normaliser too.
-
-        Raises:
-            UserError: the two differ in dimensions, members or layers.
-        """
-        for name, theirs in other.arguments.items():
-            if self.arguments[name] != theirs:
-                raise UserError(f"{name} is {theirs} there and {self.arguments[name]} here; leave it as it is there.")
-        self.load_state_dict(other.state_dict())
 
     def adopt(self, other: "EnsembleDynamics", members: Tensor) -> None:
         """Takes over the weights of those members (M,) bool of an ensemble of the same shape."""

@@ -4,20 +4,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from envtf_lit.data.loaders import WindowData
 from envtf_lit.files import replacing
 from envtf_lit.options.schema import Precision
-from envtf_lit.training import record_training, run_folder, trained
-from envtf_lit.world_models.lit import lit_world_model, window_data
-from envtf_lit.world_models.options import TrainModelOptions
+from envtf_lit.training import Curves, record_training, run_folder, trained
+from envtf_lit.world_models.lit import LitWorldModel, lit_world_model, window_data
+from envtf_lit.world_models.options import WorldModelOptions
 from envtf_lit.world_models.store import save_world_model
 from envtf_lit.world_models.termination import TERMINATION, learn_termination, save_termination
 
 
 def fit_world_model(
-    options: TrainModelOptions,
+    options: WorldModelOptions,
     dataset: Path,
     target: Path,
     *,
+    held_out: float,
     seed: int,
     precision: Precision,
     compile: bool,
@@ -31,6 +33,7 @@ def fit_world_model(
         options: of the model and its training.
         dataset: HDF5 or NPZ.
         target: folder of the weights, metrics, curves and resolved options.
+        held_out: share of the episodes kept for validation.
         seed: of everything random; global seeds and threads are the caller's.
         precision: of matrix products in training.
         compile: trains through torch.compile.
@@ -43,16 +46,14 @@ def fit_world_model(
         Parameters, epoch of the kept weights, and their held-out errors; those of the termination head, too, where
         the data are of a robot whose rule is unknown, and some episode terminates.
     """
-
-    budget = options.ensemble or options
-    data = window_data(str(dataset), options, seed=seed)
+    data = window_data(str(dataset), options, held_out=held_out, seed=seed)
     lit = lit_world_model(data.observation_dim, data.action_dim, options, seed=seed, compile=compile)
     with trained(
         lit,
         data,
         run=run_folder(root, "train_model", settings, [dataset]),
         target=target,
-        epochs=budget.updates // budget.updates_per_epoch,
+        epochs=options.updates // options.updates_per_epoch,
         precision=precision,
         progress=progress,
         monitor=lit.monitor,
@@ -63,7 +64,12 @@ def fit_world_model(
 
 
 def publish_world_model(
-    target: Path, lit: Any, data: Any, curves: Any, best: Mapping[str, float], settings: dict[str, Any]
+    target: Path,
+    lit: LitWorldModel,
+    data: WindowData,
+    curves: Curves,
+    best: Mapping[str, float],
+    settings: dict[str, Any],
 ) -> dict[str, Any]:
     """Fits what comes after training, uncertainty and perhaps a termination head, and writes a world model's folder.
 
@@ -78,14 +84,13 @@ def publish_world_model(
     Returns:
         As `fit_world_model`.
     """
-
     lit.fit_uncertainty(data)
     names = {"epoch": "epoch", "open_loop_error": "val/open_loop_error", "val_loss": "val/loss"}
-    metrics: dict[str, Any] = {"parameters": sum(p.numel() for p in lit.kept.parameters())}
+    metrics: dict[str, Any] = {"parameters": sum(p.numel() for p in lit.best_model.parameters())}
     metrics |= {name: best[column] for name, column in names.items() if column in best}
     head = learn_termination(data.train, seed=lit.seed) if data.dataset.task is None else None
     with replacing(target) as folder:
-        save_world_model(folder, lit.kept)
+        save_world_model(folder, lit.best_model)
         if head is not None:
             save_termination(folder / TERMINATION, head)
             metrics |= head.scores(data.held_out)

@@ -1,4 +1,4 @@
-"""Forecasts along recorded episodes, on the model's own predictions or teacher-forced, and their errors."""
+"""Open-loop and teacher-forced forecasts of a world model along recorded episodes, and their errors."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -12,6 +12,7 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
 from envtf_lit.world_models.interface import Mode, Prediction, WorldModel
 from envtf_lit.world_models.normaliser import CONSTANT
+from envtf_lit.world_models.unroll import unroll
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,22 +147,29 @@ def forecast(
         mode: predictions are the mean's, or draws from the predictive distribution.
         generator: of those draws.
     """
-    rows = torch.argsort(trajectories.lengths, descending=True, stable=True)
+    order = torch.argsort(trajectories.lengths, descending=True, stable=True)
     running = trajectories.valid.sum(0).tolist()  # trajectories that last until each step
-    mean = torch.zeros_like(trajectories.targets)
-    std, tail = torch.zeros_like(trajectories.targets), None
-    first, none = trajectories.observations[rows, :1], trajectories.actions[rows, :0]
-    state = model.init(first, none, torch.ones_like(trajectories.lengths))
-    for t in range(trajectories.actions.shape[1]):
-        if running[t] <= len(rows) // 2:  # most have ended: go on with the others
-            rows = rows[: running[t]]
-            state = model.gather(state, torch.arange(len(rows), device=rows.device))
-        if t > 0 and (feedback == "recorded" or t <= history):
-            state = model.observe(state, trajectories.observations[rows, t])
-        state, prediction = model.step(state, trajectories.actions[rows, t], mode=mode, generator=generator)
+    mean, std = torch.zeros_like(trajectories.targets), torch.zeros_like(trajectories.targets)
+    first, none = trajectories.observations[order, :1], trajectories.actions[order, :0]
+    state, tail = model.init(first, none, torch.ones_like(trajectories.lengths)), None
+
+    def act(t: int, rows: Tensor, observation: Tensor) -> Tensor:
+        return trajectories.actions[order[rows], t]
+
+    def select(t: int, rows: Tensor) -> Tensor | None:
+        half_ended = running[t] <= len(rows) // 2  # go on with the others
+        return torch.arange(running[t], device=rows.device) if half_ended else None
+
+    def observe(t: int, rows: Tensor) -> Tensor | None:
+        shown = t > 0 and (feedback == "recorded" or t <= history)
+        return trajectories.observations[order[rows], t] if shown else None
+
+    length = trajectories.actions.shape[1]
+    for step in unroll(model, state, act, length, mode=mode, select=select, observe=observe, generator=generator):
+        rows, prediction = order[step.rows], step.prediction
         sampled = torch.cat([prediction.observation, prediction.reward[:, None]], dim=-1)
-        mean[rows, t] = prediction.mean if mode == "mean" else sampled
-        std[rows, t], tail = _total_std(prediction), prediction.tail
+        mean[rows, step.index] = prediction.mean if mode == "mean" else sampled
+        std[rows, step.index], tail = _total_std(prediction), prediction.tail
     return Forecast(mean, std, tail)
 
 

@@ -1,4 +1,4 @@
-"""What every world model offers, whatever is inside: imagination, evaluation and planning see only this."""
+"""The world-model interface, all that imagination and evaluation see: a batched simulator, and what it predicts."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -11,7 +11,7 @@ Mode = Literal["mean", "sample"]
 
 @dataclass(frozen=True)
 class Prediction:
-    """One imagined step for a batch of B rows, in the data's own units unless said otherwise.
+    """Predictive distribution of one step, and an outcome of it, for B rows; in the data's units unless said otherwise.
 
     Attributes:
         observation: (B, S) next state.
@@ -40,7 +40,7 @@ class Prediction:
 
 
 class WorldModel(Protocol):
-    """A batched, seeded simulator with an explicit state.
+    """Interface of a batched, seeded simulator with an explicit state.
 
     States are consumed: after `step` only the returned state is valid, since caches are written in place.
     """

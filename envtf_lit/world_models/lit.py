@@ -1,10 +1,10 @@
-"""The LightningModules of the world models: they wire objective, optimiser and validation, nothing else."""
+"""LightningModules that train the world models: they wire objective, optimiser and validation, nothing else."""
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, ClassVar, cast
 
 import lightning as L
 import torch
@@ -13,9 +13,11 @@ from torch import Tensor
 from envtf_lit import training
 from envtf_lit.data.loaders import WindowData, epoch_generator
 from envtf_lit.errors import UserError
+from envtf_lit.options.schema import build
 from envtf_lit.world_models.ensemble import EnsembleDynamics
+from envtf_lit.world_models.finetuning import start_from
 from envtf_lit.world_models.forecast import Scale, open_loop_error, segments, whole_episodes
-from envtf_lit.world_models.options import EnsembleOptions, ModelOptions, TrainModelOptions
+from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions, WorldModelOptions
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from envtf_lit.world_models.uncertainty.recalibration import calibration_split
@@ -29,64 +31,65 @@ IMPROVEMENT = 0.01  # of a member's held-out error, below which it counts as non
 def lit_world_model(
     observation_dim: int,
     action_dim: int,
-    options: TrainModelOptions | None = None,
+    options: WorldModelOptions,
     seed: int = 0,
     init_from: str | None = None,
     freeze: Sequence[str] = (),
     compile: bool = False,
 ) -> "LitWorldModel":
-    """The module that trains what the options name: the ensemble if they have a section for it, or the transformer."""
-    options = options or TrainModelOptions()
-    kind = LitWorldModel if options.ensemble is None else LitEnsemble
+    """LightningModule of the kind of model that the options are of."""
+    kind = LitWorldModel if isinstance(options, TransformerOptions) else LitEnsemble
     return kind(observation_dim, action_dim, options, seed, init_from, freeze, compile)
 
 
-def window_data(path: str, options: TrainModelOptions, *, seed: int) -> WindowData:
-    """The data that such options are trained on."""
-    return WindowData(path, **window_options(options), held_out=options.held_out, seed=seed)
+def window_data(path: str, options: WorldModelOptions, *, held_out: float, seed: int) -> WindowData:
+    """The data module of windows that such options are trained on."""
+    return WindowData(path, **window_options(options), held_out=held_out, seed=seed)
 
 
-def window_options(options: TrainModelOptions) -> dict[str, Any]:
-    """What the options ask of `WindowData`; an ensemble wants windows of one step, as many batches as members."""
-    ensemble, budget = options.ensemble, options.ensemble or options
+def window_options(options: WorldModelOptions) -> dict[str, Any]:
+    """Arguments of `WindowData`; an ensemble wants windows of one step, as many batches as members."""
+    single = isinstance(options, EnsembleOptions)
     return dict(
-        context=options.model.context if ensemble is None else 1,
-        batch_size=budget.batch_size,
-        updates_per_epoch=budget.updates_per_epoch,
-        members=None if ensemble is None else ensemble.members,
+        context=1 if single else options.context,
+        batch_size=options.batch_size,
+        updates_per_epoch=options.updates_per_epoch,
+        members=options.members if single else None,
     )
 
 
 class LitWorldModel(L.LightningModule):
-    """Trains an Environment Transformer on windows of a log.
+    """LightningModule that trains an Environment Transformer on windows of a log.
 
     Attributes:
-        monitor: logged name by which the kept weights are selected, or None where the module selects them itself.
+        monitor: logged name by which the best weights are selected, or None where the module selects them itself.
 
     Args:
         observation_dim: S.
         action_dim: A.
         options: architecture, objective and optimisation; a plain dictionary when read from a checkpoint.
         seed: of dropout and of sampled objectives.
-        init_from: a published model folder whose weights to start from; see `start_from` of the models.
+        init_from: a published model folder whose weights to start from; see `finetuning.start_from`.
         freeze: parts of the model that stay as they are, such as `blocks`.
         compile: fuses the operations of the training loss, which pays on a GPU.
     """
 
+    Options: ClassVar[type[WorldModelOptions]] = TransformerOptions
     monitor: str | None = "val/open_loop_error"
 
     def __init__(
         self,
         observation_dim: int,
         action_dim: int,
-        options: TrainModelOptions | dict[str, Any] | None = None,
+        options: WorldModelOptions | dict[str, Any] | None = None,
         seed: int = 0,
         init_from: str | None = None,
         freeze: Sequence[str] = (),
         compile: bool = False,
     ) -> None:
         super().__init__()
-        self.options = _train_options(options)
+        plain = dict(options) if isinstance(options, Mapping) else asdict(options or self.Options())
+        self.options: Any = build(self.Options, plain, "")
         self.save_hyperparameters(
             dict(
                 observation_dim=observation_dim,
@@ -97,7 +100,7 @@ class LitWorldModel(L.LightningModule):
             )
         )
         self.seed, self.init_from = seed, init_from
-        self.model: Any = self._build(observation_dim, action_dim)
+        self.model: EnvironmentTransformer | EnsembleDynamics = self._build(observation_dim, action_dim)
         training.freeze(self.model, freeze)
         # "reduce-overhead" replays the kernels of all batches of a shape as one recorded graph
         self.loss = torch.compile(self.model.loss, mode="reduce-overhead") if compile else self.model.loss
@@ -106,8 +109,8 @@ class LitWorldModel(L.LightningModule):
         return EnvironmentTransformer(observation_dim, action_dim, **asdict(self.options.model))
 
     @property
-    def kept(self) -> Any:
-        """The world model to keep: the one that validation scores."""
+    def best_model(self) -> EnvironmentTransformer | EnsembleDynamics:
+        """The world model that is validated, and published once training is over."""
         return self.model
 
     @property
@@ -120,9 +123,15 @@ class LitWorldModel(L.LightningModule):
         data: WindowData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
         self.model.normaliser.fit(data.train)
         if self.init_from is not None:
-            _start_from(self.model, load_world_model(self.init_from), self.init_from)
+            self._start_from(self.init_from)
         self.scale = Scale.of(data.train, self.device)
         self.segments = segments(data.held_out, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=self.seed).to(self.device)
+
+    def _start_from(self, folder: str) -> None:
+        try:
+            start_from(self.model, load_world_model(folder))
+        except UserError as error:
+            raise UserError(f"{folder} does not fit the model: {error}") from None
 
     def fit_uncertainty(self, data: WindowData) -> None:
         """Fits the epistemic variance to training windows, then both variances' scale to half the held-out episodes.
@@ -132,11 +141,12 @@ class LitWorldModel(L.LightningModule):
         self._fit_epistemic(data)
         calibration, _ = calibration_split(data.held_out)
         if calibration is not None:
-            self.model.recalibrate(whole_episodes(calibration, CALIBRATION_EPISODES, seed=self.seed))
+            model = cast(EnvironmentTransformer, self.model)  # the ensemble's module has its own way
+            model.recalibrate(whole_episodes(calibration, CALIBRATION_EPISODES, seed=self.seed))
 
     def _fit_epistemic(self, data: WindowData) -> None:
         batches = data.training_tiles(EPISTEMIC_TOKENS)
-        self.kept.eval().fit_epistemic(batches, generator=epoch_generator(self.seed, 0, "clusters"))
+        self.best_model.eval().fit_epistemic(batches, generator=epoch_generator(self.seed, 0, "clusters"))
 
     def on_train_epoch_start(self) -> None:
         # one stream per epoch, for dropout as for sampling: a resumed run draws what an uninterrupted one would have
@@ -144,30 +154,30 @@ class LitWorldModel(L.LightningModule):
         torch.manual_seed(epoch_generator(self.seed, self.current_epoch, stream).initial_seed())
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
-        loss = self.loss(batch) * self._share(batch["mask"])
+        loss = self.loss(batch) * self._process_weight(batch["mask"])
         self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch["mask"]), sync_dist=True)
         return loss
 
-    def _share(self, mask: Tensor) -> Tensor | float:
-        """What makes the mean over processes, of means over their own tokens, the mean over all tokens."""
+    def _process_weight(self, mask: Tensor) -> Tensor | float:
+        """Of this process's mean loss per token, so that the mean over processes is that over all tokens."""
         if self.trainer.world_size == 1:
             return 1.0
         tokens = mask.sum()
         return tokens / self.trainer.strategy.reduce(tokens.clone(), reduce_op="mean")
 
     def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
-        self._judge("val", batch, batch_index)
+        self._log_errors("val", batch, batch_index)
 
     def test_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
-        self._judge("test", batch, batch_index)
+        self._log_errors("test", batch, batch_index)
 
-    def _judge(self, split: str, batch: dict[str, Tensor], batch_index: int) -> None:
+    def _log_errors(self, split: str, batch: dict[str, Tensor], batch_index: int) -> None:
         """Logs the batch's loss, and once the open-loop error: in a step, where a model spread over GPUs is whole."""
         tokens = int(batch["mask"].sum())
-        self.log(f"{split}/loss", self.kept.loss(batch), batch_size=tokens, sync_dist=True)
+        self.log(f"{split}/loss", self.best_model.loss(batch), batch_size=tokens, sync_dist=True)
         if batch_index == 0:
-            with torch.autocast(self.device.type, enabled=False):  # as the saved model is judged
-                error = open_loop_error(self.kept, self.segments, self.scale)
+            with torch.autocast(self.device.type, enabled=False):  # as the saved model is evaluated
+                error = open_loop_error(self.best_model, self.segments, self.scale)
             self.log(f"{split}/open_loop_error", error, prog_bar=split == "val", batch_size=1, sync_dist=True)
 
     @property
@@ -211,11 +221,13 @@ class LitWorldModel(L.LightningModule):
 
 
 class LitEnsemble(LitWorldModel):
-    """Trains an ensemble on bootstrap resamples until no member's held-out error falls any more (MBPO's recipe).
+    """LightningModule that trains an ensemble on bootstrap resamples until no member's held-out error falls.
 
-    Each member is kept as it was when its own error was least. Arguments as of `LitWorldModel`.
+    The recipe is MBPO's. Each member is kept as it was when its own error was least. Arguments as of `LitWorldModel`.
     """
 
+    model: EnsembleDynamics  # pyright: ignore[reportIncompatibleVariableOverride]
+    Options = EnsembleOptions
     monitor = None
     best_error: Tensor
     stale: Tensor
@@ -224,7 +236,7 @@ class LitEnsemble(LitWorldModel):
         self,
         observation_dim: int,
         action_dim: int,
-        options: TrainModelOptions | dict[str, Any] | None = None,
+        options: WorldModelOptions | dict[str, Any] | None = None,
         seed: int = 0,
         init_from: str | None = None,
         freeze: Sequence[str] = (),
@@ -232,22 +244,16 @@ class LitEnsemble(LitWorldModel):
     ) -> None:
         super().__init__(observation_dim, action_dim, options, seed, init_from, freeze, compile)
         self.best = copy.deepcopy(self.model).requires_grad_(False)  # a module, so that checkpoints hold it
-        self.register_buffer("best_error", torch.full((self.ensemble.members,), torch.inf))
+        self.register_buffer("best_error", torch.full((self.options.members,), torch.inf))
         self.register_buffer("stale", torch.zeros((), dtype=torch.int64))  # epochs since a member improved
 
-    @property
-    def ensemble(self) -> EnsembleOptions:
-        """The options that count here."""
-        assert self.options.ensemble is not None
-        return self.options.ensemble
-
     def _build(self, observation_dim: int, action_dim: int) -> EnsembleDynamics:
-        o = self.ensemble
+        o = self.options
         return EnsembleDynamics(observation_dim, action_dim, members=o.members, elites=o.elites, hidden=o.hidden)
 
     @property
-    def kept(self) -> EnsembleDynamics:
-        """The members at their best."""
+    def best_model(self) -> EnsembleDynamics:
+        """The members, each as it was when its own held-out error was least."""
         return self.best
 
     @property
@@ -255,7 +261,7 @@ class LitEnsemble(LitWorldModel):
         """The recipe has none."""
 
     def setup(self, stage: str) -> None:
-        """As for the transformer; the kept members begin as the trained ones."""
+        """As for the transformer; the best members begin as the trained ones."""
         super().setup(stage)
         self.best.load_state_dict(self.model.state_dict())
 
@@ -267,13 +273,13 @@ class LitEnsemble(LitWorldModel):
         self._stop_when_stale()  # a run may have been killed just after it stopped
 
     def _stop_when_stale(self) -> None:
-        if int(self.stale) >= self.ensemble.patience:
+        if int(self.stale) >= self.options.patience:
             self.trainer.should_stop = True
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
         loss = self.loss(batch)
-        self.log("train/loss", loss / self.ensemble.members, on_step=False, on_epoch=True, batch_size=1)
-        return loss + self.model.decay(self.ensemble.weight_decay)
+        self.log("train/loss", loss / self.options.members, on_step=False, on_epoch=True, batch_size=1)
+        return loss + self.model.decay(self.options.weight_decay)
 
     def on_validation_epoch_start(self) -> None:
         self.squared, self.entries = torch.zeros_like(self.best_error), torch.zeros_like(self.best_error[0])
@@ -287,37 +293,17 @@ class LitEnsemble(LitWorldModel):
         error = self.squared / self.entries
         self.log("val/loss", error.mean())
         if self.trainer.state.fn == "fit":
-            self._keep_the_best(error)
+            self._update_best(error)
             self._stop_when_stale()
-        self.log("val/open_loop_error", open_loop_error(self.kept, self.segments, self.scale), prog_bar=True)
+        self.log("val/open_loop_error", open_loop_error(self.best_model, self.segments, self.scale), prog_bar=True)
 
-    def _keep_the_best(self, error: Tensor) -> None:
+    def _update_best(self, error: Tensor) -> None:
         """Takes over the members that improved, given the held-out errors of all (M,)."""
         improved = error < (1.0 - IMPROVEMENT) * self.best_error
         self.best.adopt(self.model, improved)
         self.best_error = torch.where(improved, error, self.best_error)
-        self.best.elite.copy_(self.best_error.argsort()[: self.ensemble.elites])
+        self.best.elite.copy_(self.best_error.argsort()[: self.options.elites])
         self.stale = torch.where(improved.any(), 0, self.stale + 1)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.Adam(self.model.parameters(), lr=self.ensemble.learning_rate, fused=True)
-
-
-def _start_from(model: Any, other: Any, folder: str) -> None:
-    """Lets a model start from another of its kind, read from a folder."""
-    try:
-        if type(model) is not type(other):
-            raise UserError(f"it is of another kind, {type(other).__name__}; see model.options.ensemble.")
-        model.start_from(other)
-    except UserError as error:
-        raise UserError(f"{folder} does not fit the model: {error}") from None
-
-
-def _train_options(options: TrainModelOptions | dict[str, Any] | None) -> TrainModelOptions:
-    """Options as given, or rebuilt from the plain dictionary of a checkpoint."""
-    if options is None:
-        return TrainModelOptions()
-    if isinstance(options, TrainModelOptions):
-        return options
-    ensemble = None if options["ensemble"] is None else EnsembleOptions(**options["ensemble"])
-    return TrainModelOptions(**{**options, "model": ModelOptions(**options["model"]), "ensemble": ensemble})
+        return torch.optim.Adam(self.model.parameters(), lr=self.options.learning_rate, fused=True)

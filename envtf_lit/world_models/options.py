@@ -5,7 +5,7 @@ from typing import Literal
 
 from envtf_lit.errors import UserError
 from envtf_lit.options.numbers import Count, Natural, NonNegative, Positive, Share
-from envtf_lit.options.schema import check_epochs
+from envtf_lit.options.schema import check_epochs, rare
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class ModelOptions:
     width: Count = 128
     context: Count = 16
     dropout: Share = 0.0
-    activation: Literal["relu", "gelu"] = "gelu"
+    activation: Literal["relu", "gelu"] = rare("gelu")
     objective: Literal["beta_nll", "nll", "paper_mse"] = "beta_nll"
     target: Literal["delta", "absolute"] = "delta"
     epistemic: Literal["laplace", "head", "none"] = "laplace"
-    random_features: Natural = 128
+    random_features: Natural = rare(128)
     bounded: bool = False
 
 
@@ -62,10 +62,10 @@ class TransformerOptions(ModelOptions):
     updates_per_epoch: Count = 1_000
     batch_size: Count = 32
     learning_rate: Positive = 0.001
-    warmup: Share = 0.05
-    weight_decay: NonNegative = 0.0001
-    eps: Positive = 0.00000001
-    gradient_clip: Positive = 1.0
+    warmup: Share = rare(0.05)
+    weight_decay: NonNegative = rare(0.0001)
+    eps: Positive = rare(0.00000001)
+    gradient_clip: Positive = rare(1.0)
 
     def __post_init__(self) -> None:
         check_epochs(self)

@@ -1,15 +1,12 @@
-"""World models on disk, through a closed registry: no class is ever imported by a name found in a file."""
+"""Saving and loading of world models, through a closed registry: no class is imported by a name found in a file."""
 
 from pathlib import Path
-from typing import Any
-
-from torch import nn
 
 from envtf_lit.files import load_module, save_module
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
-WORLD_MODELS: dict[str, type[nn.Module]] = {
+WORLD_MODELS: dict[str, type[EnvironmentTransformer] | type[EnsembleDynamics]] = {
     "environment_transformer": EnvironmentTransformer,
     "ensemble_dynamics": EnsembleDynamics,
 }
@@ -21,8 +18,8 @@ def save_world_model(folder: str | Path, model: EnvironmentTransformer | Ensembl
     save_module(folder, model, kind=kind, arguments=model.arguments)
 
 
-def load_world_model(folder: str | Path, *, fused: bool = False) -> Any:
-    """The world model saved in a folder, in eval mode; it follows `WorldModel`.
+def load_world_model(folder: str | Path, *, fused: bool = False) -> EnvironmentTransformer | EnsembleDynamics:
+    """The world model saved in a folder, in eval mode, without gradients.
 
     Args:
         folder: as `save_world_model` wrote it.
@@ -32,7 +29,7 @@ def load_world_model(folder: str | Path, *, fused: bool = False) -> Any:
     Raises:
         UserError: the folder is missing, damaged, or holds something that is not a world model.
     """
-    model: Any = load_module(folder, WORLD_MODELS).requires_grad_(False)
+    model = load_module(folder, WORLD_MODELS).requires_grad_(False)
     if fused:
         model.fuse()
     return model

@@ -1,11 +1,11 @@
-"""Where a robot whose rule nobody wrote down terminates: learned from the log, by the next state alone.
+"""Learned termination: a classifier of next states, fitted to the log of a robot whose rule is not known.
 
 The robots of the twenty tasks have their rules in `envtf_lit.robots.tasks`; this is for data of one's own.
 """
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ HIDDEN, UPDATES, BATCH, LEARNING_RATE = 64, 2_000, 256, 0.003
 
 
 class TerminationHead(nn.Module):
-    """A classifier of next observations.
+    """Binary classifier of next observations: terminated or not.
 
     Attributes:
         mean, std: (S,) of the training data's next observations; constant dimensions have std 1.
@@ -64,41 +64,41 @@ class TerminationHead(nn.Module):
         mean, std = moments(torch.as_tensor(columns[rows]) for rows in column_blocks(columns))
         self.mean.copy_(mean)
         self.std.copy_(torch.where(std < CONSTANT, 1.0, std))
-        fell, stood = np.flatnonzero(training.terminated), np.flatnonzero(~training.terminated)
+        ended, going = np.flatnonzero(training.terminated), np.flatnonzero(~training.terminated)
         label = (torch.arange(BATCH) < BATCH // 2).float()
         optimizer = torch.optim.AdamW(self.layers.parameters(), lr=LEARNING_RATE)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, UPDATES)
         for _ in range(UPDATES):
-            drawn = [rows[torch.randint(len(rows), (BATCH // 2,), generator=generator)] for rows in (fell, stood)]
+            drawn = [rows[torch.randint(len(rows), (BATCH // 2,), generator=generator)] for rows in (ended, going)]
             logits = self(torch.as_tensor(columns[np.concatenate(drawn)]))
             optimizer.zero_grad()
             F.binary_cross_entropy_with_logits(logits, label).backward()
             optimizer.step()
             schedule.step()
-        self.threshold.copy_(self._odds(training).kthvalue(len(stood)).values)
+        self.threshold.copy_(self._log_odds(training).kthvalue(len(going)).values)
 
     @torch.no_grad()
-    def _odds(self, dataset: OfflineDataset) -> Tensor:
+    def _log_odds(self, dataset: OfflineDataset) -> Tensor:
         """(N,) of every row."""
         columns = dataset.next_observations
         return torch.cat([self(torch.as_tensor(columns[rows])) for rows in column_blocks(columns)])
 
     def scores(self, held_out: OfflineDataset) -> dict[str, float]:
-        """How it does on other episodes.
+        """Recall and false-alarm rate on other episodes.
 
         Returns:
-            `termination_false_alarms`, the share of rows that did not terminate and are said to; and, if any row
+            `termination_false_alarms`, the share of rows that did not terminate and are predicted to; and, if any row
             terminated, `termination_recall`, the share of those that are found.
         """
-        said, fell = (self._odds(held_out) > self.threshold).numpy(), held_out.terminated
-        found = {"termination_false_alarms": float(said[~fell].mean())}
-        if fell.any():
-            found["termination_recall"] = float(said[fell].mean())
+        predicted, terminated = (self._log_odds(held_out) > self.threshold).numpy(), held_out.terminated
+        found = {"termination_false_alarms": float(predicted[~terminated].mean())}
+        if terminated.any():
+            found["termination_recall"] = float(predicted[terminated].mean())
         return found
 
 
 def learn_termination(training: OfflineDataset, *, seed: int) -> TerminationHead | None:
-    """A fitted head, or None where no row terminated (or every row did): there is nothing to learn."""
+    """A fitted classifier, or None where no row terminated (or every row did): there is nothing to learn."""
     if not 0 < training.terminated.sum() < len(training):
         return None
     with torch.random.fork_rng(devices=[]):
@@ -113,8 +113,8 @@ def save_termination(folder: str | Path, head: TerminationHead) -> None:
     save_module(folder, head, kind="termination_head", arguments={"observation_dim": head.observation_dim})
 
 
-def load_termination(folder: str | Path) -> Any:
-    """The `TerminationHead` saved in a folder, in eval mode.
+def load_termination(folder: str | Path) -> TerminationHead:
+    """The classifier saved in a folder, in eval mode.
 
     Raises:
         UserError: the folder is missing, damaged, or holds something else.
@@ -126,7 +126,7 @@ TERMINATION = "termination"  # below the world model, where it had to be learned
 
 
 def termination_source(task: str | None, model: Path) -> Literal["rule", "learned", "none"]:
-    """Where imagined rollouts end.
+    """What ends imagined rollouts.
 
     Args:
         task: robot and tier, whose rule is known; None for a robot of one's own.
@@ -141,7 +141,7 @@ def termination_source(task: str | None, model: Path) -> Literal["rule", "learne
 
 
 def termination_rule(task: str | None, model: Path, device: torch.device) -> Callable[[Tensor], Tensor]:
-    """What decides whether imagined robots have fallen: next observations (..., S) to bool (...).
+    """Termination function of imagined rollouts: next observations (..., S) to bool (...).
 
     Args:
         task, model: as of `termination_source`.

@@ -1,7 +1,15 @@
-"""The Environment Transformer: one causal transformer, one token per state-action pair."""
+"""The Environment Transformer: a causal transformer over state-action pairs, one token per pair.
+
+    x_t = W_e [s_t, a_t] + b_e                      the pair, z-scored
+    h_t = norm(blocks(x_{t - context + 1}, …, x_t))
+    mu_t, log S_au_t = W_h h_t + b_h                of the state's change and the reward, in unit scale
+    s_{t+1}, r_t ~ N(mu_t, S_au_t + S_eu_t)         back in the data's units; after `recalibrate` with a tail
+
+S_au is the aleatoric variance; the epistemic one, S_eu, comes from the posterior of W_h.
+"""
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
@@ -9,41 +17,22 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from envtf_lit.errors import UserError
-from envtf_lit.world_models.attention import Block, _cache_type, _take, rotate, rotation, window_mask
+from envtf_lit.world_models.attention import Block, rotation, window_mask
+from envtf_lit.world_models.cache import TransformerState
 from envtf_lit.world_models.forecast import Trajectories, forecast
 from envtf_lit.world_models.interface import Mode, Prediction
 from envtf_lit.world_models.normaliser import Normaliser
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 from envtf_lit.world_models.options import ModelOptions
 from envtf_lit.world_models.uncertainty.laplace import LastLayerLaplace, RandomFeatures, clusters
-from envtf_lit.world_models.uncertainty.recalibration import fitted, normal_scores
+from envtf_lit.world_models.uncertainty.recalibration import fitted_factor_and_tail, normal_scores
 from envtf_lit.world_models.uncertainty.tails import log_density, stretch
 
 LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -14.0, 4.0
 
 
-@dataclass(frozen=True)
-class TransformerState:
-    """A batch of rollouts under way: the ring cache, the clock, and the state that has no action yet.
-
-    Attributes:
-        cache: per layer, keys and values (context, B, H, d), in `_cache_type`; token t lies in slot t mod context, and
-            slots that have held none hold nothing.
-        clock: position of the next token, the same for all rows (histories are right-aligned).
-        first: (B,) position of each row's first token, or None where all rows began at 0.
-        observation: (B, S) current observation.
-        drawn: (B, D + 1, S + 1) each row's last layer, drawn from the posterior; None where all use the trained one.
-    """
-
-    cache: list[tuple[Tensor, Tensor]]
-    clock: int
-    first: Tensor | None
-    observation: Tensor
-    drawn: Tensor | None = None
-
-
 class EnvironmentTransformer(nn.Module):
-    """Predicts next state and reward with aleatoric variance, from up to `context` past state-action pairs.
+    """World model that predicts next state and reward, with their variances, from the last `context` pairs.
 
     Epistemic variance is the posterior of the last layer (`epistemic="laplace"`, zero until `laplace.fit`), or the
     paper's third head. A score of the outcome sees only the sum of the two variances, so how such a head splits it is
@@ -101,40 +90,6 @@ class EnvironmentTransformer(nn.Module):
         """What the constructor needs to build this module again."""
         return dict(observation_dim=self.observation_dim, action_dim=self.action_dim, **asdict(self.options))
 
-    @torch.no_grad()
-    def start_from(self, other: "EnvironmentTransformer") -> None:
-        """Takes over another model's weights; this one keeps its normaliser, which knows its own data.
-
-        The blocks must be alike. A projection of the same dimensions is taken over too, rescaled so that in the data's
-        own units the model predicts what the other does (variances as far as their bounds let them); others, such as
-        those of another robot, begin anew. So do posterior, recalibration and tail.
-
-        Raises:
-            UserError: the two differ in what the weights mean.
-        """
-        mine, theirs = asdict(self.options), asdict(other.options)
-        for name in ("layers", "heads", "width", "activation", "target"):
-            if mine[name] != theirs[name]:
-                raise UserError(f"{name} is {theirs[name]} there and {mine[name]} here; leave it as it is there.")
-        for part in ("blocks", "norm"):
-            getattr(self, part).load_state_dict(getattr(other, part).state_dict())
-        if self.observation_dim != other.observation_dim:
-            return
-        if self.action_dim == other.action_dim:
-            (old_mean, old_std), (mean, std) = other.normaliser.input_scale(), self.normaliser.input_scale()
-            self.embed.weight.copy_(other.embed.weight * (std / old_std))
-            self.embed.bias.copy_(other.embed.bias + other.embed.weight @ ((mean - old_mean) / old_std))
-        if self.head.weight.shape == other.head.weight.shape:
-            self._take_over_head(other)
-
-    def _take_over_head(self, other: "EnvironmentTransformer") -> None:
-        old, new = other.normaliser, self.normaliser
-        ratio = old.target_std / new.target_std  # (S + 1,)
-        weights, biases = other.head.weight.split(len(ratio)), other.head.bias.split(len(ratio))
-        mean = biases[0] * ratio + (old.target_mean - new.target_mean) / new.target_std
-        self.head.weight.copy_(torch.cat([weights[0] * ratio[:, None], *weights[1:]]))
-        self.head.bias.copy_(torch.cat([mean, *(bias + 2 * ratio.log() for bias in biases[1:])]))
-
     def forward(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Whole sequences (B, T, S) and (B, T, A) to mean, log-variance and epistemic log-variance, (B, T, S + 1).
 
@@ -172,30 +127,8 @@ class EnvironmentTransformer(nn.Module):
 
     def loss(self, batch: dict[str, Tensor], *, generator: torch.Generator | None = None) -> Tensor:
         """Mean objective per valid token and output dimension of a batch of windows (see `data.loaders.Windows`)."""
-        observations, actions, options = batch["observations"], batch["actions"], self.options
-        if self.training and options.any_step > 0.0:
-            observations = self._partly_hidden(observations)
-        if self.training and options.scheduled_sampling > 0.0:
-            observations = self._partly_imagined(observations, actions)
-        passes = options.multi_step if self.training else 1
-        total = torch.zeros((), device=observations.device)
-        for number in range(passes):
-            outputs = self(observations, actions)
-            total = total + self._objective(outputs, observations, batch, generator)
-            if number + 1 < passes:
-                observations = self._one_step_ahead(outputs[0], observations)
-        return total / passes
-
-    def _objective(
-        self,
-        outputs: tuple[Tensor, Tensor, Tensor | None],
-        observations: Tensor,
-        batch: dict[str, Tensor],
-        generator: torch.Generator | None,
-    ) -> Tensor:
-        """The objective of predictions from these observations, which need not be the true ones."""
-        mean, log_variance, epistemic = outputs
-        target = self.normaliser.target(observations, batch["next_observations"], batch["rewards"])
+        mean, log_variance, epistemic = self(batch["observations"], batch["actions"])
+        target = self.normaliser.target(batch["observations"], batch["next_observations"], batch["rewards"])
         if self.options.objective == "paper_mse":
             assert epistemic is not None
             loss = paper_mse(mean, log_variance, epistemic, target, generator=generator)
@@ -204,150 +137,6 @@ class EnvironmentTransformer(nn.Module):
                 log_variance = torch.logaddexp(log_variance, epistemic)
             loss = {"nll": nll, "beta_nll": beta_nll}[self.options.objective](mean, log_variance, target)
         return (loss * batch["mask"]).sum() / (batch["mask"].sum() * target.shape[-1])
-
-    def _one_step_ahead(self, mean: Tensor, observations: Tensor) -> Tensor:
-        """What the model makes of each state (B, T, S) stands in the next one's place; the first one stays."""
-        imagined = self.normaliser.outcome(observations, mean)[:, :-1, :-1]
-        return torch.cat([observations[:, :1], imagined], dim=1)
-
-    def _partly_hidden(self, observations: Tensor) -> Tensor:
-        """Observations (B, T, S), some of them replaced by the last one shown, a share of its own in each window.
-
-        The model then predicts several steps ahead from the actions alone (any-step dynamics, Lin et al. 2024).
-        """
-        B, T, _ = observations.shape
-        share = self.options.any_step * torch.rand(B, 1, device=observations.device)
-        hidden = torch.rand(B, T, device=observations.device) < share
-        hidden[:, 0] = False
-        shown = torch.arange(T, device=observations.device).expand(B, T).masked_fill(hidden, 0).cummax(1).values
-        return torch.take_along_dim(observations, shown[..., None], 1)
-
-    @torch.no_grad()
-    def _partly_imagined(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """Observations (B, T, S), a share of them replaced by what the model predicts from the true past.
-
-        Scheduled sampling (Bengio et al. 2015) for all tokens at once (Mihaylova and Martins 2019).
-        """
-        imagined = self._one_step_ahead(self(observations, actions)[0], observations)
-        chosen = torch.rand(imagined.shape[:-1], device=imagined.device) < self.options.scheduled_sampling
-        return torch.where(chosen[..., None], imagined, observations)
-
-    @torch.no_grad()
-    def fit_epistemic(self, batches: Iterable[dict[str, Tensor]], *, generator: torch.Generator) -> None:
-        """Fits the last layer's posterior to the valid tokens of training windows; nothing to do without one.
-
-        Args:
-            batches: as `loss` takes them.
-            generator: of the clusters of (s, a) that set the posterior's scale, and of random features.
-        """
-        if self.laplace is None or self.random_features is None:
-            return
-        parts = []
-        for batch in batches:
-            batch = {name: column.to(self.head.weight.device) for name, column in batch.items()}
-            valid = batch["mask"].bool()
-            hidden, _ = self.encode(batch["observations"], batch["actions"], cached=False)
-            target = self.normaliser.target(batch["observations"], batch["next_observations"], batch["rewards"])
-            token = self.normaliser.token(batch["observations"], batch["actions"])
-            parts.append([column[valid] for column in (hidden.float(), target, token)])
-        hidden, target, token = (torch.cat(columns) for columns in zip(*parts, strict=True))
-        del parts
-        groups = clusters(token, generator)
-        self.random_features.fit(token, generator)
-        mean, log_variance, _ = self.heads(hidden)
-        self.laplace.fit(self.posterior_inputs(hidden, token), target, mean, log_variance.exp(), groups)
-
-    def posterior_inputs(self, hidden: Tensor, token: Tensor) -> Tensor:
-        """(..., P) what the posterior sees of hidden tokens (..., D) and the pairs (..., S + A) they end in."""
-        assert self.random_features is not None
-        return torch.cat([hidden.float(), self.random_features(token)], -1)
-
-    def recalibrate(self, trajectories: Trajectories) -> None:
-        """Fits `recalibration` and `tail` to episodes kept out of training.
-
-        Not of the paper's objective, whose collapsed variances are what it is there to show.
-        """
-        if self.options.objective == "paper_mse":
-            return
-        self.recalibration.fill_(1.0)
-        self.tail.zero_()
-        trajectories = trajectories.to(self.recalibration.device)
-        factor, tail = fitted(normal_scores(forecast(self, trajectories, feedback="recorded"), trajectories))
-        self.recalibration.copy_(factor)
-        self.tail.copy_(tail)
-
-    def init(
-        self,
-        observations: Tensor,
-        actions: Tensor,
-        lengths: Tensor,
-        window: Tensor | None = None,
-        *,
-        posterior: float = 0.0,
-        generator: torch.Generator | None = None,
-    ) -> TransformerState:
-        """See `WorldModel.init`. One causal pass over the windows serves all rollouts that begin in them."""
-        B, longest = len(lengths), observations.shape[1] - 1  # rollouts, and tokens of a history
-        window = torch.arange(B, device=lengths.device) if window is None else window
-        current = observations[window, lengths - 1]
-        clock = min(longest, self.options.context - 1)  # all rows' tokens before the current states lie in one slot
-        size = (self.options.context, B, self.options.heads, self.options.width // self.options.heads)
-        kind = _cache_type(current.device)
-        cache = [(current.new_empty(size, dtype=kind), current.new_empty(size, dtype=kind)) for _ in self.blocks]
-        first = None
-        if clock > 0:
-            shift = clock - (lengths - 1)  # (B,) from a token's position in the window to that in the cache
-            index = torch.arange(clock, device=shift.device)[:, None] - shift  # (clock, B)
-            first = shift.clamp(min=0) if bool((shift > 0).any()) else None
-            _, tokens = self.encode(observations[:, :-1], actions, cached=True)
-            for (keys, values), (k, v) in zip(cache, tokens, strict=True):
-                k, v = (x.transpose(1, 2)[window, index.clamp(min=0)] for x in (k, v))  # (clock, B, H, d)
-                keys[:clock], values[:clock] = rotate(k.float(), self._rotation(shift[:, None])), v
-        drawn = posterior * self._posterior().draw(B, generator) if posterior > 0 else None
-        return TransformerState(cache, clock, first, current, drawn)
-
-    def _posterior(self) -> LastLayerLaplace:
-        if self.laplace is None:
-            raise UserError(
-                "This world model has no posterior to draw from, since it was trained with epistemic: "
-                f"{self.options.epistemic}: set posterior to 0, or train one with epistemic: laplace."
-            )
-        return self.laplace
-
-    def step(
-        self,
-        state: TransformerState,
-        action: Tensor,
-        *,
-        mode: Mode = "mean",
-        generator: torch.Generator | None = None,
-    ) -> tuple[TransformerState, Prediction]:
-        """See `WorldModel.step`. One token per call; the cache is written in place unless gradients are needed."""
-        token = self.normaliser.token(state.observation, action)
-        x = self.embed(token)  # (B, D)
-        mask = self._visible(state, min(state.clock + 1, self.options.context))
-        cos_sin = self._rotation(torch.full((1,), state.clock, device=x.device))
-        cache = []
-        for block, (keys, values) in zip(self._stack(), state.cache, strict=True):
-            x, keys, values = block.advance(x, keys, values, mask, state.clock, cos_sin)
-            cache.append((keys, values))
-        last = self.norm(x), token, state.observation
-        prediction = self.predict(*last, state.drawn, mode=mode, generator=generator)
-        return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
-
-    def fuse(self) -> None:
-        """Lets `step` run through torch.compile from now on: by blocks, which are alike, so that one serves all."""
-        for block in self._stack():
-            block.advance = torch.compile(block.advance, dynamic=True)  # the clock and the number of rows change
-        self.predict = torch.compile(self.predict, dynamic=True)
-
-    def _visible(self, state: TransformerState, filled: int) -> Tensor | None:
-        """(C, B, 1), which of the filled slots hold a token of the row itself; None where all do."""
-        if state.first is None:
-            return None
-        slot = torch.arange(filled, device=state.observation.device)
-        position = state.clock - (state.clock - slot) % self.options.context
-        return (position[:, None] >= state.first)[..., None]
 
     def predict(
         self,
@@ -397,6 +186,60 @@ class EnvironmentTransformer(nn.Module):
             tail=self.tail,
         )
 
+    def posterior_inputs(self, hidden: Tensor, token: Tensor) -> Tensor:
+        """(..., P) what the posterior sees of hidden tokens (..., D) and the pairs (..., S + A) they end in."""
+        assert self.random_features is not None
+        return torch.cat([hidden.float(), self.random_features(token)], -1)
+
+    def _posterior(self) -> LastLayerLaplace:
+        if self.laplace is None:
+            raise UserError(
+                "This world model has no posterior to draw from, since it was trained with epistemic: "
+                f"{self.options.epistemic}: set posterior to 0, or train one with epistemic: laplace."
+            )
+        return self.laplace
+
+    def init(
+        self,
+        observations: Tensor,
+        actions: Tensor,
+        lengths: Tensor,
+        window: Tensor | None = None,
+        *,
+        posterior: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> TransformerState:
+        """See `WorldModel.init`. One causal pass over the windows serves all rollouts that begin in them."""
+        B = len(lengths)
+        window = torch.arange(B, device=lengths.device) if window is None else window
+        drawn = posterior * self._posterior().draw(B, generator) if posterior > 0 else None
+        state = TransformerState.empty(self.options, observations[window, lengths - 1], drawn)
+        if observations.shape[1] == 1 or self.options.context == 1:
+            return state
+        _, tokens = self.encode(observations[:, :-1], actions, cached=True)
+        return state.remember(tokens, window, lengths)
+
+    def step(
+        self,
+        state: TransformerState,
+        action: Tensor,
+        *,
+        mode: Mode = "mean",
+        generator: torch.Generator | None = None,
+    ) -> tuple[TransformerState, Prediction]:
+        """See `WorldModel.step`. One token per call; the cache is written in place unless gradients are needed."""
+        token = self.normaliser.token(state.observation, action)
+        x = self.embed(token)  # (B, D)
+        mask = state.visible()
+        cos_sin = self._rotation(torch.full((1,), state.clock, device=x.device))
+        cache = []
+        for block, (keys, values) in zip(self._stack(), state.cache, strict=True):
+            x, keys, values = block.advance(x, keys, values, mask, state.clock, cos_sin)
+            cache.append((keys, values))
+        last = self.norm(x), token, state.observation
+        prediction = self.predict(*last, state.drawn, mode=mode, generator=generator)
+        return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
+
     def observe(self, state: TransformerState, observation: Tensor) -> TransformerState:
         """See `WorldModel.observe`."""
         return replace(state, observation=observation)
@@ -408,15 +251,58 @@ class EnvironmentTransformer(nn.Module):
     def fork(self, state: TransformerState, n: int) -> TransformerState:
         """See `WorldModel.fork`."""
         index = torch.arange(len(state.observation), device=state.observation.device).repeat_interleave(n)
-        return self.gather(state, index)
+        return state.gather(index)
 
     def gather(self, state: TransformerState, index: Tensor) -> TransformerState:
         """See `WorldModel.gather`."""
-        filled = min(state.clock, self.options.context)
-        cache = [(_take(keys, index, filled), _take(values, index, filled)) for keys, values in state.cache]
-        first = None if state.first is None else state.first[index]
-        drawn = None if state.drawn is None else state.drawn[index]
-        return TransformerState(cache, state.clock, first, state.observation[index], drawn)
+        return state.gather(index)
+
+    def fuse(self) -> None:
+        """Lets `step` run through torch.compile from now on: by blocks, which are alike, so that one serves all."""
+        for block in self._stack():
+            block.advance = torch.compile(block.advance, dynamic=True)  # the clock and the number of rows change
+        self.predict = torch.compile(self.predict, dynamic=True)
+
+    @torch.no_grad()
+    def fit_epistemic(self, batches: Iterable[dict[str, Tensor]], *, generator: torch.Generator) -> None:
+        """Fits the last layer's posterior to the valid tokens of training windows; nothing to do without one.
+
+        Args:
+            batches: as `loss` takes them.
+            generator: of the clusters of (s, a) that set the posterior's scale, and of random features.
+        """
+        if self.laplace is None or self.random_features is None:
+            return
+        parts = []
+        for batch in batches:
+            batch = {name: column.to(self.head.weight.device) for name, column in batch.items()}
+            valid = batch["mask"].bool()
+            hidden, _ = self.encode(batch["observations"], batch["actions"], cached=False)
+            target = self.normaliser.target(batch["observations"], batch["next_observations"], batch["rewards"])
+            token = self.normaliser.token(batch["observations"], batch["actions"])
+            parts.append([column[valid] for column in (hidden.float(), target, token)])
+        hidden, target, token = (torch.cat(columns) for columns in zip(*parts, strict=True))
+        del parts
+        groups = clusters(token, generator)
+        self.random_features.fit(token, generator)
+        mean, log_variance, _ = self.heads(hidden)
+        self.laplace.fit(self.posterior_inputs(hidden, token), target, mean, log_variance.exp(), groups)
+
+    def recalibrate(self, trajectories: Trajectories) -> None:
+        """Fits `recalibration` and `tail` to episodes kept out of training.
+
+        Not of the paper's objective, whose collapsed variances are what it is there to show.
+        """
+        if self.options.objective == "paper_mse":
+            return
+        self.recalibration.fill_(1.0)
+        self.tail.zero_()
+        trajectories = trajectories.to(self.recalibration.device)
+        factor, tail = fitted_factor_and_tail(
+            normal_scores(forecast(self, trajectories, feedback="recorded"), trajectories)
+        )
+        self.recalibration.copy_(factor)
+        self.tail.copy_(tail)
 
 
 def _initialise(module: nn.Module) -> None:

@@ -1,4 +1,4 @@
-"""Epistemic variance of a linear last layer: how far a token lies from those the model was trained on.
+"""Last-layer Laplace approximation: epistemic variance, large where a token is far from those of the training data.
 
 A score of the outcome sees only the sum of aleatoric and epistemic variance, so no head can learn to tell them apart.
 The last layer, though, is a linear regression on the hidden token, and for that the posterior is known in closed form
@@ -31,7 +31,7 @@ NARROW = 0.01  # of the largest variance, below which a direction's counts as th
 
 
 class RandomFeatures(nn.Module):
-    """`count` rectified random projections of the whitened input: half-spaces, and how deep in them it lies.
+    """Random ReLU features: `count` rectified random projections of the whitened input.
 
     As features (Rahimi and Recht 2007) of the arc-cosine kernel (Cho and Saul 2009), their directions orthogonal as far
     as there are dimensions (Yu et al. 2016). Zero until `fit`.
@@ -67,7 +67,9 @@ class RandomFeatures(nn.Module):
 
 
 class LastLayerLaplace(nn.Module):
-    """`S_eu(x) = c diag(R) q(x)` with the leverage `q = phi^T (Phi^T Phi + lambda I)^-1 phi`, phi = [1, features].
+    """Posterior of the last layer, and the epistemic variance that follows: `S_eu(x) = c diag(R) q(x)`.
+
+    The leverage is `q = phi^T (Phi^T Phi + lambda I)^-1 phi`, phi = [1, features].
 
     Features are what the last layer sees, the hidden token, and behind it what it might have seen, random features.
     Until `fit` it knows no data and says zero.
@@ -210,7 +212,7 @@ def _surprise(squared: Tensor, aleatoric: Tensor, spread: Tensor) -> Tensor:
     return torch.stack([0.5 * (squared / variance + variance.log()).sum() for variance in variances]).to(SCALES.device)
 
 
-def quantile(values: Tensor, share: float) -> Tensor:
-    """Of any number of values; `torch.quantile` takes 16 million."""
-    rank = max(1, round(share * len(values)))
+def quantile(values: Tensor, probability: float) -> Tensor:
+    """Quantile of any number of values; `torch.quantile` takes 16 million."""
+    rank = max(1, round(probability * len(values)))
     return values.kthvalue(rank).values

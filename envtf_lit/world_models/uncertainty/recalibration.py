@@ -1,4 +1,4 @@
-"""Predictive intervals that hold what they promise on episodes the model was not trained on.
+"""Recalibration of predictive distributions on held-out episodes: a variance factor and a tail for each output.
 
 A Gaussian fitted by likelihood matches the mean square of its residuals. Those of a robot that touches the ground have
 heavy tails, so the match is too wide for nine residuals in ten. Two numbers for each output mend that after training:
@@ -31,15 +31,15 @@ def calibration_split(held_out: OfflineDataset) -> tuple[OfflineDataset | None, 
     return held_out.select(range(1, count, 2)), held_out.select(range(0, count, 2))
 
 
-def normal_scores(taught: Forecast, trajectories: Trajectories) -> Tensor:
+def normal_scores(teacher_forced: Forecast, trajectories: Trajectories) -> Tensor:
     """(valid steps, S + 1) of the recorded outcomes, given a teacher-forced forecast; honest ones are standard normal.
 
     They are `(recorded - mean) / std` where the forecast is Gaussian. A predicted std of zero gives infinity, or zero
     where the prediction is exact.
     """
-    error = (trajectories.targets - taught.mean)[trajectories.valid].double()
-    z = torch.where(error == 0.0, error, error / taught.std[trajectories.valid].double())
-    return z if taught.tail is None else normal_score(z, taught.tail.double())
+    error = (trajectories.targets - teacher_forced.mean)[trajectories.valid].double()
+    z = torch.where(error == 0.0, error, error / teacher_forced.std[trajectories.valid].double())
+    return z if teacher_forced.tail is None else normal_score(z, teacher_forced.tail.double())
 
 
 def variance_factor(residuals: Tensor) -> Tensor:
@@ -56,7 +56,7 @@ def variance_factor(residuals: Tensor) -> Tensor:
     return (bound / ANCHOR).square().nan_to_num(nan=FACTORS[1]).clamp(*FACTORS)
 
 
-def fitted(residuals: Tensor) -> tuple[Tensor, Tensor]:
+def fitted_factor_and_tail(residuals: Tensor) -> tuple[Tensor, Tensor]:
     """(K,) factors of the predictive variance, and the tails that go with them, of standardised residuals (n, K)."""
     factor = variance_factor(residuals)
     return factor, fitted_tail(residuals / factor.sqrt())

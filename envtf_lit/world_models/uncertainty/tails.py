@@ -1,4 +1,4 @@
-"""The shape of predicted outcomes: Gaussian, or with heavier tails.
+"""The predictive distribution: Johnson's S_U, a Gaussian with tails as heavy as the residuals'.
 
 A robot that touches the ground is predicted well nearly always and badly now and then, so that no Gaussian is right
 both about the middle of its residuals and about their ends. Johnson's S_U distribution (1949; the symmetric one) is a
