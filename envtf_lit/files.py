@@ -242,7 +242,10 @@ def check_writable(path: str | Path, *, folder: bool) -> None:
         kind = "folder" if path.is_dir() else "file" if path.exists() else "link to nowhere"
         raise UserError(f"Cannot write {path}: a {kind} of that name stands there; move it, or choose another name.")
     with contextlib.suppress(_Rehearsed), replacing(path) as temporary:
-        temporary.mkdir()
+        if folder:
+            temporary.mkdir()
+        else:
+            temporary.touch()
         raise _Rehearsed
 
 

@@ -4,6 +4,7 @@ import errno
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -130,16 +131,16 @@ def test_a_target_that_cannot_be_written_is_refused_before_training(root, monkey
     assert not (root / ".envtf/runs").exists()
 
 
-@pytest.mark.parametrize("closed", ["models", ".envtf/runs"])
-def test_a_read_only_folder_is_refused_before_training(root, monkeypatch, closed):
-    mkdir = Path.mkdir
+@pytest.mark.parametrize(("closed", "method"), [("models", "mkdir"), (".envtf/runs", "touch")])
+def test_a_read_only_folder_is_refused_before_training(root, monkeypatch, closed, method):
+    create = getattr(Path, method)
 
-    def refuse(path: Path, mode: int = 0o777, parents: bool = False, exist_ok: bool = False) -> None:
+    def refuse(path: Path, *arguments: Any, **options: Any) -> None:  # chmod would not stop the superuser
         if path.name.endswith(".partial") and path.is_relative_to(root / closed):
-            raise PermissionError(errno.EACCES, "Permission denied", str(path))  # chmod would not stop the superuser
-        mkdir(path, mode, parents, exist_ok)
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        create(path, *arguments, **options)
 
-    monkeypatch.setattr(Path, "mkdir", refuse)
+    monkeypatch.setattr(Path, method, refuse)
     train_with(monkeypatch, Idle())
     with pytest.raises(UserError, match="Permission denied; choose a folder you may write to"):
         train_model(TINY, root, progress=False)
