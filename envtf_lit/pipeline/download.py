@@ -5,6 +5,7 @@ from typing import Any
 
 from envtf_lit.data.cards import dataset_card
 from envtf_lit.data.sources.files import save_dataset
+from envtf_lit.errors import UserError
 from envtf_lit.files import write_json
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.sources import make_dataset
@@ -14,6 +15,11 @@ from envtf_lit.robots.tasks import get_task
 
 def download(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
     """Makes or reads the dataset: `data/dataset.h5` and its card, which is returned."""
+    own, target = params.download.path, root / DATASET
+    if own is not None and target.exists() and Path(own).exists() and target.samefile(own):
+        raise UserError(
+            f"download.path is {own}, which `download` itself writes: move your file to another place, and name that."
+        )
     with run_stage("download", params, root):
         dataset, origin = make_dataset(
             None if params.task is None else get_task(params.task),

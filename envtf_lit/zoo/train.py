@@ -2,6 +2,7 @@
 
 import math
 import os
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 from rich.progress import MofNCompleteColumn, TextColumn
 from safetensors.torch import save
 
-from envtf_lit.errors import UserError
+from envtf_lit.errors import UserError, missing_extra
 from envtf_lit.files import read_json, replacing, write_json
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.progress import progress_bar
@@ -95,7 +96,7 @@ def train(robot: Robot, out: Path, *, algorithm: str, steps: int, seed: int, pro
         UserError: sbx is missing, or the folder holds a series already.
     """
     folder, recipe = out / robot.name, RECIPES[algorithm]
-    if folder.exists():
+    if os.path.lexists(folder):
         raise UserError(f"{folder} exists already: name another --out, or delete it to train anew.")
     if steps <= WARM_UP_STEPS:
         raise UserError(
@@ -125,9 +126,7 @@ def _learner(robot: Robot, recipe: Recipe, seed: int) -> Any:
         import sbx  # pyright: ignore[reportMissingImports]
         from stable_baselines3.common.vec_env import DummyVecEnv  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
-        raise UserError(
-            f"Training behaviour policies needs sbx-rl ({error}): pip install 'envtf-lit[behaviour]'."
-        ) from None
+        raise missing_extra("Training behaviour policies needs sbx-rl", "behaviour", error) from None
     environments = DummyVecEnv([robot.make] * recipe.environments)
     learner = getattr(sbx, recipe.algorithm)
     return learner("MlpPolicy", environments, seed=seed, learning_starts=WARM_UP_STEPS, **recipe.arguments)
@@ -218,10 +217,12 @@ def settle(robot: Robot, zoo: Path, *, last: int = 3, noise: float = 0.5) -> Sna
     assert isinstance(output, torch.nn.Linear)
     output.bias.data[robot.action_dim :] += math.log(noise)
     content = read_json(series.folder / "zoo.json")
-    kept = _keep(actor, robot, series.snapshots[-1].steps, series.folder)
-    content["snapshots"][-1] = asdict(kept)
     content["trained_with"] += f"; {SETTLED} of the last {last}'s weights, with {noise:g} times the standard deviation"
-    write_json(series.folder / "zoo.json", content)
+    with replacing(series.folder) as folder:  # weights and what is said of them change together
+        shutil.copytree(series.folder, folder, symlinks=True)
+        kept = _keep(actor, robot, series.snapshots[-1].steps, folder)
+        content["snapshots"][-1] = asdict(kept)
+        write_json(folder / "zoo.json", content)
     return kept
 
 
