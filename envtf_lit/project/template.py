@@ -16,7 +16,7 @@ DVC_CONFIG = "[core]\n    analytics = false\n    check_update = false\n"
 
 def template_folder() -> Path:
     """Where the template's files lie: inside the installed package, or at the root of a checkout."""
-    package = Path(__file__).parent
+    package = Path(__file__).parent.parent
     shipped = package / "template"
     return shipped if shipped.is_dir() else package.parent
 
