@@ -6,32 +6,25 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning as L
 import torch
 from jsonargparse import Namespace
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
-from rich.console import Console
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.options import PolicyOptions, check_no_imagination, check_policy
-from envtf_lit.agents.store import publish_policy
-from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import TransitionData, WindowData
-from envtf_lit.data.sources.files import load_dataset
-from envtf_lit.data.sources.minari import read_minari
+from envtf_lit.cli.components import LogTransitions, LogWindows, agent, world_model
+from envtf_lit.cli.publish import KeepConfig, Publish
 from envtf_lit.errors import UserError
-from envtf_lit.files import read_json, replacing
+from envtf_lit.files import read_json
 from envtf_lit.options.schema import build_section
 from envtf_lit.pipeline.params import Params
 from envtf_lit.training import Curves
-from envtf_lit.world_models.fit import publish_world_model
-from envtf_lit.world_models.lit import LitEnsemble, LitWorldModel, lit_world_model, window_options
+from envtf_lit.world_models.lit import window_options
 from envtf_lit.world_models.options import TrainModelOptions, check_world_model
 
-CONFIGS = Path(__file__).parent / "configs"
+CONFIGS = Path(__file__).parent.parent / "configs"
 SHIPPED = ", ".join(sorted(path.stem for path in CONFIGS.glob("*.yaml")))
 
 TRUST = (
@@ -47,151 +40,6 @@ TRUST = (
 
 SECTION = "model.options"  # of the command line, which errors name
 LIGHTNINGS_OWN = re.compile(r"(best|last|hpc|registry.*|\w+://.*)$")  # checkpoints that are not local paths
-
-
-def world_model(
-    observation_dim: int,
-    action_dim: int,
-    options: TrainModelOptions = TrainModelOptions(),  # noqa: B008 (frozen)
-    seed: int = 0,
-    init_from: str | None = None,
-    freeze: list[str] = [],  # noqa: B006 (read alone)
-    compile: bool = False,
-) -> LitWorldModel:
-    """Environment Transformer, or the usual ensemble, trained on windows of a log.
-
-    Args:
-        observation_dim: S, taken from the data.
-        action_dim: A, taken from the data.
-        options: as train_model in params.yaml.
-        seed: of dropout and of sampled objectives.
-        init_from: a published model folder (as models/world_model) whose weights to start from. Scales are those of the
-            new data; projections to and from another robot's dimensions begin anew.
-        freeze: parts of the model that stay as they are: embed, blocks, blocks.0, norm, head, …
-        compile: fuses the operations of the training loss by torch.compile, which pays on a GPU.
-    """
-    return lit_world_model(observation_dim, action_dim, options, seed, init_from, freeze, compile)
-
-
-def agent(
-    observation_dim: int,
-    action_dim: int,
-    options: PolicyOptions = PolicyOptions(),  # noqa: B008 (frozen)
-    action_low: list[float] | None = None,
-    action_high: list[float] | None = None,
-    seed: int = 0,
-    init_from: str | None = None,
-    freeze: list[str] = [],  # noqa: B006 (read alone)
-) -> CQL:
-    """Conservative Q-Learning on a log alone.
-
-    Args:
-        observation_dim: S, taken from the data.
-        action_dim: A, taken from the data.
-        options: as train_policy.cql in params.yaml.
-        action_low: (A,), taken from the data.
-        action_high: (A,), taken from the data.
-        seed: of everything random.
-        init_from: a published policy folder (as models/policy/cql) whose actor to start from, with the scales of the
-            new data; layers for another robot's dimensions begin anew. Such folders hold no critics, so these start
-            anew, and the warm start fits them alone.
-        freeze: parts of the actor that stay as they are: net.0, net.2, …
-    """
-    return CQL(observation_dim, action_dim, options, action_low, action_high, seed, init_from, freeze)
-
-
-class _Sourced:
-    """Reads a dataset from where `source` says."""
-
-    source: Literal["file", "minari"]
-
-    def read(self, path: str) -> OfflineDataset:
-        """A file, or a Minari dataset of this machine; the network is for `envtf download` alone."""
-        return load_dataset(path) if self.source == "file" else read_minari(path)
-
-
-class LogWindows(_Sourced, WindowData):
-    """Windows of a log, for world models.
-
-    Args:
-        path: dataset file, HDF5 or NPZ, or a Minari dataset's id or folder.
-        source: which of the two: `file` or `minari`.
-        options: see `WindowData`.
-    """
-
-    def __init__(self, path: str, source: Literal["file", "minari"] = "file", **options: Any) -> None:
-        self.source = source
-        super().__init__(path, **options)
-
-
-class LogTransitions(_Sourced, TransitionData):
-    """Transitions of a log, for agents.
-
-    Args:
-        path: dataset file, HDF5 or NPZ, or a Minari dataset's id or folder.
-        source: which of the two: `file` or `minari`.
-        options: see `TransitionData`.
-    """
-
-    def __init__(self, path: str, source: Literal["file", "minari"] = "file", **options: Any) -> None:
-        self.source = source
-        super().__init__(path, **options)
-
-
-class Publish(Callback):
-    """Writes what was trained as a model folder, as the pipeline's stages do, beside the run's logs."""
-
-    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        # by all processes: each may hold a part of the weights
-        state, folder = trainer.strategy.lightning_module_state_dict(), _folder(trainer) / "published"
-        if not trainer.is_global_zero:
-            return
-        curves = _curves(trainer)
-        weights, row = "last update", curves.rows[-1] if curves.rows else {}
-        if isinstance(pl_module, LitEnsemble):
-            weights = "members at their best"
-        if (checkpoint := _best(trainer)) is not None:
-            saved = torch.load(checkpoint.best_model_path, map_location="cpu", weights_only=True)
-            state, row = saved["state_dict"], next((r for r in curves.rows if r["epoch"] == saved["epoch"] + 1), {})
-            weights = f"epoch of best {checkpoint.monitor}, {checkpoint.best_model_score:.4g}"
-        module = type(pl_module)(**pl_module.hparams).to(pl_module.device)  # whole, however the other one is spread
-        module.load_state_dict(state)
-        settings = dict(pl_module.hparams)
-        if isinstance(module, LitWorldModel):
-            data: WindowData = trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
-            publish_world_model(folder, module, data, curves, row, settings)
-        elif isinstance(module, CQL):
-            publish_policy(folder, module.average_actor, curves, row, settings)
-        Console().print(f"Published the weights of the {weights}: {folder}", highlight=False, soft_wrap=True)
-
-
-def _curves(trainer: L.Trainer) -> Curves:
-    """What was logged, as `instantiate_trainer` has it noted."""
-    callbacks: list[Callback] = trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
-    return next(callback for callback in callbacks if isinstance(callback, Curves))
-
-
-def _best(trainer: L.Trainer) -> ModelCheckpoint | None:
-    """The callback that kept the weights of the best epoch, where one was asked to."""
-    kept = (c for c in trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint) and c.monitor is not None)
-    return next((c for c in kept if c.best_model_path), None)
-
-
-class KeepConfig(SaveConfigCallback):
-    """Writes the whole configuration to `config.yaml` beside the run's logs, wherever the logger keeps them."""
-
-    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        self.folder = _folder(trainer)
-        super().setup(trainer, pl_module, stage)
-
-    def save_config(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        with replacing(self.folder / "config.yaml") as temporary:
-            self.parser.save(self.config, str(temporary), skip_none=False, multifile=False)
-
-
-def _folder(trainer: L.Trainer) -> Path:
-    """The run's own folder; not every logger has one. To be asked by all processes: the first tells the others."""
-    return Path(trainer.log_dir or trainer.default_root_dir)
 
 
 class _LinkedCLI(LightningCLI):
@@ -371,6 +219,9 @@ def _shipped_configs(arguments: list[str]) -> Iterator[str]:
         yield f"{flag}={value}" if flag else value
 
 
+CLASSES = {"model": (ModelCLI, world_model, LogWindows), "agent": (AgentCLI, agent, LogTransitions)}
+
+
 def run(kind: str, arguments: list[str]) -> None:
     """Runs `envtf model ARGUMENTS` or `envtf agent ARGUMENTS`.
 
@@ -401,7 +252,7 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def _run(kind: str, arguments: list[str]) -> None:
-    cli, model, data = {"model": (ModelCLI, world_model, LogWindows), "agent": (AgentCLI, agent, LogTransitions)}[kind]
+    cli, model, data = CLASSES[kind]
     cli(
         model,
         data,
