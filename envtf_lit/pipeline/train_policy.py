@@ -8,11 +8,13 @@ from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.store import publish_policy
 from envtf_lit.data.loaders import TransitionData, return_weights
+from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import pick_device
 from envtf_lit.imagination.rollouts import Imagination
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.stage import (
+    ALGORITHMS,
     DATASET,
     POLICIES,
     ROLLOUTS,
@@ -29,7 +31,13 @@ from envtf_lit.world_models.termination import termination_rule
 def train_policy(
     params: Params, root: Path = Path("."), *, algorithm: str = "et_cql", progress: bool = True
 ) -> dict[str, Any]:
-    """Trains `cql` (data alone) or `et_cql` (data and imagination): `models/policy/<algorithm>/`."""
+    """Trains `cql` (data alone) or `et_cql` (data and imagination): `models/policy/<algorithm>/`.
+
+    Raises:
+        UserError: no such algorithm, or nothing to train it on.
+    """
+    if algorithm not in ALGORITHMS:
+        raise UserError(f"Unknown algorithm {algorithm!r}: {did_you_mean(algorithm, ALGORITHMS)}")
     options: PolicyOptions = getattr(params.train_policy, algorithm)
     with run_stage(f"train_policy_{algorithm}", params, root):
         data = TransitionData(
