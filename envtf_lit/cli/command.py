@@ -1,9 +1,9 @@
 """A command is a function: its parameters are the arguments, their types the checks, its docstring the help.
 
 Positional-only parameters, and `*parameter`, are words in their order; all others are flags. jsonargparse parses and
-checks; its `add_function_arguments` would want `--quiet true` and `--robots [hopper,ant]`, so the arguments are added one
-by one: `--quiet` alone sets what is false by default, a list of choices takes several words, a list of text is a flag
-that may be repeated. Neither files nor the environment set anything, and no type here names a class to make.
+checks; its `add_function_arguments` would want `--quiet true` and `--robots [hopper,ant]`, so the arguments are added
+one by one: `--quiet` alone sets what is false by default, a list of choices takes several words, a list of text is a
+flag that may be repeated. Neither files nor the environment set anything, and no type here names a class to make.
 """
 
 import argparse
