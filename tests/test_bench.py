@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from envtf_lit.cli.main import _suite_options, build_parser, main
+from envtf_lit.cli.command import parse_words
+from envtf_lit.cli.main import main
+from envtf_lit.cli.studies import bench_cost as bench_cost_command
 from envtf_lit.robots.tasks import ROBOTS
 from envtf_lit.studies.cost import _plain, bench_cost
 from envtf_lit.studies.machine import in_turns, ratio, typical
@@ -61,7 +63,9 @@ def test_an_unknown_device_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_a_suites_budgets_come_from_the_command_line() -> None:
-    parse = lambda *flags: _suite_options(build_parser().parse_args(["bench", "cost", *flags]))  # noqa: E731
+    def parse(*flags: str) -> SuiteOptions:
+        return parse_words(bench_cost_command, "bench cost", flags)[1]["training"].options()
+
     assert parse("--threads", "2") == SuiteOptions()
     options = parse("--updates", "20", "--ensemble-updates", "30", "--threads", "1")
     assert (options.updates, options.ensemble.updates, options.ensemble.updates_per_epoch) == (20, 30, 30)

@@ -17,7 +17,8 @@ import grimp
 import pytest
 from ruamel.yaml import YAML
 
-from envtf_lit.cli.main import STAGES, build_parser, main
+from envtf_lit.cli.main import main
+from envtf_lit.cli.stages import STAGES, StageParser, split
 from envtf_lit.pipeline.yaml import load_params
 
 ROOT = Path(__file__).parent.parent
@@ -50,9 +51,11 @@ def test_every_stage_is_a_command_and_a_function() -> None:
     names = [name.partition("@")[0] for name in stages()]
     assert list(dict.fromkeys(names)) == list(STAGES)
     for name, stage in stages().items():
-        namespace, rest = build_parser().parse_known_args(shlex.split(stage["cmd"])[1:])
-        assert (namespace.command, rest) == (name.partition("@")[0], [])
-        assert callable(getattr(import_module(f"envtf_lit.pipeline.{namespace.command}"), namespace.command))
+        program, command, *words = shlex.split(stage["cmd"])
+        own, overrides = split(words)
+        assert (program, command, overrides) == ("envtf", name.partition("@")[0], [])
+        assert StageParser(command).parse_args(own).params == "params.yaml"
+        assert callable(getattr(import_module(f"envtf_lit.pipeline.{command}"), command))
 
 
 def test_every_tracked_option_is_in_params_yaml() -> None:

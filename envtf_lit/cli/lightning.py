@@ -1,38 +1,28 @@
 """`envtf model …` and `envtf agent …`: LightningCLI over the classes that the pipeline trains."""
 
-import itertools
 import json
-import os
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning as L
-import torch
-from jsonargparse import Namespace
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from rich.console import Console
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
-from envtf_lit.agents.cql import CQL
-from envtf_lit.agents.options import PolicyOptions, check_no_imagination, check_policy
-from envtf_lit.agents.store import publish_policy
+from envtf_lit.agents.registry import ALGORITHMS
+from envtf_lit.cli.components import LogTransitions, LogWindows, agent_of, world_model_of
+from envtf_lit.cli.publish import KeepConfig, Publish
 from envtf_lit.cli.saved_options import checkpoint_options, model_architecture, policy_architecture
-from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import TransitionData, WindowData
-from envtf_lit.data.sources.files import load_dataset
-from envtf_lit.data.sources.minari import read_minari
-from envtf_lit.errors import UserError
-from envtf_lit.files import replacing
-from envtf_lit.options.schema import build_section
+from envtf_lit.data.loaders import UPDATES_PER_STEP
+from envtf_lit.errors import UserError, did_you_mean
+from envtf_lit.options.schema import build
 from envtf_lit.pipeline.params import Params
 from envtf_lit.training import Curves, WholeCheckpoints
-from envtf_lit.world_models.fit import publish_world_model
-from envtf_lit.world_models.lit import LitEnsemble, LitWorldModel, lit_world_model, window_options
-from envtf_lit.world_models.options import TrainModelOptions, check_world_model
+from envtf_lit.world_models.options import KINDS, TransformerOptions
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SHIPPED = ", ".join(sorted(path.stem for path in CONFIGS.glob("*.yaml")))
@@ -44,8 +34,7 @@ TRUST = (
     "--model.options.updates N, or --trainer.max_epochs N to leave the learning-rate schedule as it is. A model that "
     "starts from another (--model.init_from) has its architecture where no flag says otherwise. After fit, the weights "
     "of the last update, or of the best epoch where a ModelCheckpoint with a monitor says which that is, lie in the "
-    "folder `published`, or `published_1`, …, beside an earlier run's; its path is printed. --config takes a file, or "
-    "the name of one that comes along: "
+    "folder `published`, whose path is printed. --config takes a file, or the name of one that comes along: "
     f"{SHIPPED}."
 )
 
@@ -53,168 +42,12 @@ SECTION = "model.options"  # of the command line, which errors name
 LIGHTNINGS_OWN = re.compile(r"(best|last|hpc|registry.*|\w+://.*)$")  # checkpoints that are not local paths
 
 
-def world_model(
-    observation_dim: int,
-    action_dim: int,
-    options: TrainModelOptions = TrainModelOptions(),  # noqa: B008 (frozen)
-    seed: int = 0,
-    init_from: str | None = None,
-    freeze: list[str] = [],  # noqa: B006 (read alone)
-    compile: bool = False,
-) -> LitWorldModel:
-    """Environment Transformer, or the usual ensemble, trained on windows of a log.
-
-    Args:
-        observation_dim: S, taken from the data.
-        action_dim: A, taken from the data.
-        options: as train_model in params.yaml.
-        seed: of dropout and of sampled objectives.
-        init_from: a published model folder (as models/world_model) whose weights to start from. Scales are those of the
-            new data; projections to and from another robot's dimensions begin anew.
-        freeze: parts of the model that stay as they are: embed, blocks, blocks.0, norm, head, …
-        compile: fuses the operations of the training loss by torch.compile, which pays on a GPU.
-    """
-    return lit_world_model(observation_dim, action_dim, options, seed, init_from, freeze, compile)
-
-
-def agent(
-    observation_dim: int,
-    action_dim: int,
-    options: PolicyOptions = PolicyOptions(),  # noqa: B008 (frozen)
-    action_low: list[float] | None = None,
-    action_high: list[float] | None = None,
-    seed: int = 0,
-    init_from: str | None = None,
-    freeze: list[str] = [],  # noqa: B006 (read alone)
-) -> CQL:
-    """Conservative Q-Learning on a log alone.
-
-    Args:
-        observation_dim: S, taken from the data.
-        action_dim: A, taken from the data.
-        options: as train_policy.cql in params.yaml.
-        action_low: (A,), taken from the data.
-        action_high: (A,), taken from the data.
-        seed: of everything random.
-        init_from: a published policy folder (as models/policy/cql) whose actor to start from, with the scales of the
-            new data; layers for another robot's dimensions begin anew. Such folders hold no critics, so these start
-            anew, and the warm start fits them alone.
-        freeze: parts of the actor that stay as they are: net.0, net.2, …
-    """
-    return CQL(observation_dim, action_dim, options, action_low, action_high, seed, init_from, freeze)
-
-
-class _Sourced:
-    """Reads a dataset from where `source` says."""
-
-    source: Literal["file", "minari"]
-
-    def read(self, path: str) -> OfflineDataset:
-        """A file, or a Minari dataset of this machine; the network is for `envtf download` alone."""
-        return load_dataset(path) if self.source == "file" else read_minari(path)
-
-
-class LogWindows(_Sourced, WindowData):
-    """Windows of a log, for world models.
-
-    Args:
-        path: dataset file, HDF5 or NPZ, or a Minari dataset's id or folder.
-        source: which of the two: `file` or `minari`.
-        options: see `WindowData`.
-    """
-
-    def __init__(self, path: str, source: Literal["file", "minari"] = "file", **options: Any) -> None:
-        self.source = source
-        super().__init__(path, **options)
-
-
-class LogTransitions(_Sourced, TransitionData):
-    """Transitions of a log, for agents.
-
-    Args:
-        path: dataset file, HDF5 or NPZ, or a Minari dataset's id or folder.
-        source: which of the two: `file` or `minari`.
-        options: see `TransitionData`.
-    """
-
-    def __init__(self, path: str, source: Literal["file", "minari"] = "file", **options: Any) -> None:
-        self.source = source
-        super().__init__(path, **options)
-
-
-class Publish(Callback):
-    """Writes what was trained as a model folder, as the pipeline's stages do, beside the run's logs.
-
-    What an earlier run published there stays, and a trial run, `fast_dev_run`, leaves nothing behind.
-    """
-
-    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        # by all processes: each may hold a part of the weights
-        state, place = trainer.strategy.lightning_module_state_dict(), _folder(trainer) / "published"
-        if trainer.fast_dev_run or not trainer.is_global_zero:  # pyright: ignore[reportAttributeAccessIssue]
-            return
-        folder = _free(place)
-        curves = _curves(trainer)
-        weights, row = "last update", curves.rows[-1] if curves.rows else {}
-        if isinstance(pl_module, LitEnsemble):
-            weights = "members at their best"
-        if (checkpoint := _best(trainer)) is not None:
-            saved = torch.load(checkpoint.best_model_path, map_location="cpu", weights_only=True)
-            state, row = saved["state_dict"], next((r for r in curves.rows if r["epoch"] == saved["epoch"] + 1), {})
-            weights = f"epoch of best {checkpoint.monitor}, {checkpoint.best_model_score:.4g}"
-        module = type(pl_module)(**pl_module.hparams).to(pl_module.device)  # whole, however the other one is spread
-        module.load_state_dict(state)
-        settings = dict(pl_module.hparams)
-        if isinstance(module, LitWorldModel):
-            data: WindowData = trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
-            publish_world_model(folder, module, data, curves, row, settings)
-        elif isinstance(module, CQL):
-            publish_policy(folder, module.average_actor, curves, row, settings)
-        Console().print(f"Published the weights of the {weights}: {folder}", highlight=False, soft_wrap=True)
-
-
-def _curves(trainer: L.Trainer) -> Curves:
-    """What was logged, as `instantiate_trainer` has it noted."""
-    callbacks: list[Callback] = trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
-    return next(callback for callback in callbacks if isinstance(callback, Curves))
-
-
-def _best(trainer: L.Trainer) -> ModelCheckpoint | None:
-    """The callback that kept the weights of the best epoch, where one was asked to."""
-    kept = (c for c in trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint) and c.monitor is not None)
-    return next((c for c in kept if c.best_model_path), None)
-
-
-class KeepConfig(SaveConfigCallback):
-    """Writes the whole configuration to `config.yaml`, or `config_1.yaml`, …, beside the run's logs."""
-
-    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        self.folder = _folder(trainer)
-        super().setup(trainer, pl_module, stage)
-
-    def save_config(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        with replacing(_free(self.folder / "config.yaml")) as temporary:
-            self.parser.save(self.config, str(temporary), skip_none=False, multifile=False)
-
-
-def _folder(trainer: L.Trainer) -> Path:
-    """The run's own folder; not every logger has one. To be asked by all processes: the first tells the others."""
-    return Path(trainer.log_dir or trainer.default_root_dir)
-
-
-def _free(path: Path) -> Path:
-    """The path, or the first of `NAME_1`, `NAME_2`, … that is not there: without a logger, runs share a folder."""
-    numbered = (path.with_stem(f"{path.stem}_{number}") for number in itertools.count(1))
-    return next(free for free in itertools.chain([path], numbered) if not os.path.lexists(free))
-
-
 class _LinkedCLI(LightningCLI):
     """Takes dimensions from the dataset, asks only once for what model and data share, and stops when updates say."""
 
     from_data: tuple[str, ...] = ("observation_dim", "action_dim")
     links: dict[str, str]
-    options: type[TrainModelOptions] | type[PolicyOptions]
-    architecture: Callable[[str], dict[str, Any]]  # the options that a published folder's weights ask for
+    options: type[Any]  # the options class of the kind or algorithm that was chosen
     verbs: tuple[str, ...]
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -259,12 +92,8 @@ class _LinkedCLI(LightningCLI):
         return trainer
 
     @staticmethod
-    def check(options: Any) -> None:
-        """The rules that tie these options together, as for params.yaml.
-
-        Raises:
-            UserError: one is broken.
-        """
+    def architecture(folder: str) -> dict[str, Any]:
+        """The options that a published folder's weights ask for."""
         raise NotImplementedError
 
     def _parse_ckpt_path(self) -> None:
@@ -273,72 +102,53 @@ class _LinkedCLI(LightningCLI):
     def before_instantiate_classes(self) -> None:
         config = self.config[str(self.subcommand)]
         options, trainer = config.model.options, config.trainer
-        self.check(build_section(self.options, _plain(options), SECTION))
-        build_section(Params, {"seed": config.model.seed}, "model")
-        budget = _unwrapped(options).get("ensemble") or options
+        plain = build(self.options, options.as_dict(), SECTION)
+        build(Params, {"seed": config.model.seed}, "model")
         if trainer.max_epochs is None and trainer.max_steps == -1:
-            trainer.max_epochs = budget.updates // budget.updates_per_epoch
+            trainer.max_epochs = plain.updates // plain.updates_per_epoch
         if trainer.gradient_clip_val is None:  # refused under the agents' manual optimisation, and they have none
-            trainer.gradient_clip_val = budget.get("gradient_clip")
+            trainer.gradient_clip_val = options.get("gradient_clip")
 
 
 class ModelCLI(_LinkedCLI):
-    """`envtf model`."""
+    """`envtf model`, for one kind of world model."""
 
-    options = TrainModelOptions
-    architecture = staticmethod(model_architecture)
     verbs = ("fit", "validate", "test")
-    links = {"model.options.held_out": "data.held_out", "model.seed": "data.seed"}
-
-    @staticmethod
-    def check(options: TrainModelOptions) -> None:
-        check_world_model(options, SECTION)
+    links = {
+        "model.seed": "data.seed",
+        "model.options.batch_size": "data.batch_size",
+        "model.options.updates_per_epoch": "data.updates_per_epoch",
+    }
 
     def link_more(self, parser: LightningArgumentParser) -> None:
-        for name in ("context", "batch_size", "updates_per_epoch", "members"):
-            parser.link_arguments("model.options", f"data.{name}", compute_fn=_window_option(name))
+        if self.options is TransformerOptions:
+            parser.link_arguments("model.options.context", "data.context")
+        else:
+            parser.link_arguments("model.options.members", "data.members")
+            parser.set_defaults({"data.context": 1})
+
+    @staticmethod
+    def architecture(folder: str) -> dict[str, Any]:
+        return model_architecture(folder)
 
 
 class AgentCLI(_LinkedCLI):
-    """`envtf agent`."""
+    """`envtf agent`, for one algorithm."""
 
-    options = PolicyOptions
-    architecture = staticmethod(policy_architecture)
     verbs = ("fit", "validate")
     from_data = ("observation_dim", "action_dim", "action_low", "action_high")
-    links = {
-        "model.options.batch_size": "data.batch_size",
-        "model.options.updates_per_step": "data.updates_per_step",
-        "model.options.discount": "data.discount",
-        "model.options.n_step": "data.n_step",
+    links = {f"model.options.{name}": f"data.{name}" for name in ("batch_size", "discount", "n_step")} | {
         "model.options.return_temperature": "data.return_temperature",
         "model.seed": "data.seed",
     }
 
-    @staticmethod
-    def check(options: PolicyOptions) -> None:
-        check_no_imagination(options, SECTION)
-        check_policy(options, SECTION)
-
     def link_more(self, parser: LightningArgumentParser) -> None:
-        updates = ("model.options.updates_per_epoch", "model.options.updates_per_step")
-        parser.link_arguments(updates, "data.steps_per_epoch", compute_fn=lambda epoch, step: epoch // (step or 1))
+        steps = lambda updates: updates // UPDATES_PER_STEP  # noqa: E731
+        parser.link_arguments("model.options.updates_per_epoch", "data.steps_per_epoch", compute_fn=steps)
 
-
-def _window_option(name: str) -> Callable[[Namespace], Any]:
-    return lambda options: window_options(_unwrapped(options))[name]
-
-
-def _unwrapped(options: Namespace) -> Any:
-    """The ensemble's options as plain attributes: while jsonargparse links, it wraps an optional dataclass."""
-    ensemble = options.get("ensemble") or Namespace()
-    return Namespace({**vars(options), "ensemble": ensemble.get("init_args", ensemble) or None})
-
-
-def _plain(options: Namespace) -> dict[str, Any]:
-    """The options as nested dictionaries, whatever jsonargparse wraps around optional dataclasses."""
-    values = {name: _plain(value) if isinstance(value, Namespace) else value for name, value in vars(options).items()}
-    return values.get("init_args", values)
+    @staticmethod
+    def architecture(folder: str) -> dict[str, Any]:
+        return policy_architecture(folder)
 
 
 def _shipped_configs(arguments: list[str]) -> Iterator[str]:
@@ -381,11 +191,20 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def _run(kind: str, arguments: list[str]) -> None:
-    cli, model, data = {"model": (ModelCLI, world_model, LogWindows), "agent": (AgentCLI, agent, LogTransitions)}[kind]
-    cli(
+    arguments = [*_shipped_configs(arguments)]
+    if kind == "model":
+        name = _chosen("kind", arguments, KINDS, "transformer")
+        cli, model, data, options = ModelCLI, world_model_of(name), LogWindows, KINDS[name]
+    else:
+        name = _chosen("algorithm", arguments, ALGORITHMS, "cql")
+        if ALGORITHMS[name].imagines:
+            raise UserError(f"{name} needs a world model: add it below train_policy in params.yaml, and `dvc repro`.")
+        cli, model, data, options = AgentCLI, agent_of(name), LogTransitions, ALGORITHMS[name].Options
+    chosen = type(cli.__name__, (cli,), {"options": options})
+    chosen(
         model,
         data,
-        args=[*_shipped_configs(arguments)],
+        args=arguments,
         seed_everything_default=0,
         auto_configure_optimizers=False,
         trainer_defaults={
@@ -400,3 +219,33 @@ def _run(kind: str, arguments: list[str]) -> None:
             "description": f"{(model.__doc__ or '').splitlines()[0]} {TRUST}",
         },
     )
+
+
+def _chosen(option: str, arguments: list[str], known: Mapping[str, Any], default: str) -> str:
+    """The value of `--model.OPTION`, on which the other options depend, among the arguments or in a --config file.
+
+    Raises:
+        UserError: an unknown one.
+    """
+    flag, found = f"--model.{option}", default
+    for before, argument in zip(["", *arguments], arguments, strict=False):
+        name, _, value = argument.partition("=")
+        if before in ("--config", "-c") or name == "--config":
+            found = _configured(Path(value or argument), option) or found
+        if before == flag or (name == flag and value):
+            found = argument if before == flag else value
+    if found not in known:
+        raise UserError(f"{flag} is {found!r}: {did_you_mean(found, known)}")
+    return found
+
+
+def _configured(path: Path, option: str) -> str | None:
+    """What a configuration file says of the option; an odd file is for the parser to refuse."""
+    try:
+        tree = YAML(typ="safe", pure=True).load(path.read_text("utf-8"))
+        for section in (tree, tree.get("fit"), tree.get("validate"), tree.get("test")):
+            if isinstance(section, dict) and isinstance(section.get("model"), dict) and option in section["model"]:
+                return str(section["model"][option])
+    except (OSError, ValueError, AttributeError, YAMLError):
+        pass
+    return None

@@ -12,16 +12,16 @@ import torch
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.errors import UserError
 from envtf_lit.files import read_json
-from envtf_lit.options.schema import build_section
+from envtf_lit.options.schema import build
 from envtf_lit.pipeline.params import Params
-from envtf_lit.world_models.options import TrainModelOptions
+from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions
 
-MODELS = {"environment_transformer": "model", "ensemble_dynamics": "ensemble"}  # kind to section of the options
 PART = re.compile(r"[A-Za-z_]\w*(\.\w+)*", re.ASCII)  # of a module, as it can be frozen
+SAVED = {"environment_transformer": TransformerOptions, "ensemble_dynamics": EnsembleOptions}  # by a folder's kind
 
 
 def model_architecture(folder: str | Path) -> dict[str, Any]:
-    """The options of `TrainModelOptions` that a published world model's weights ask for, as plain values.
+    """The options that a published world model's weights ask for, as plain values.
 
     Empty where the folder's kind is no world model's, which is for the loader to refuse.
 
@@ -29,19 +29,23 @@ def model_architecture(folder: str | Path) -> dict[str, Any]:
         UserError: no config.json, or arguments that are not options.
     """
     kind, arguments = _config(folder)
-    if kind not in MODELS:
+    if kind not in SAVED:
         return {}
     given = {name: value for name, value in arguments.items() if name not in ("observation_dim", "action_dim")}
-    return _architecture(folder, TrainModelOptions, {MODELS[kind]: given})
+    if kind == "ensemble_dynamics" and isinstance(given.get("hidden"), list):  # which its training's options go with
+        given["weight_decay"] = [0.0] * (len(given["hidden"]) + 1)
+    plain = _architecture(folder, SAVED[kind], given)
+    plain.pop("weight_decay", None)
+    return plain
 
 
 def policy_architecture(folder: str | Path) -> dict[str, Any]:
-    """The options of `PolicyOptions` that a published policy's weights ask for; otherwise as `model_architecture`."""
+    """The options of a policy that a published one's weights ask for; otherwise as `model_architecture`."""
     _, arguments = _config(folder)
     return _architecture(folder, PolicyOptions, {name: arguments[name] for name in ("hidden",) if name in arguments})
 
 
-def checkpoint_options(path: str | Path, cls: type[TrainModelOptions] | type[PolicyOptions]) -> dict[str, Any]:
+def checkpoint_options(path: str | Path, cls: type[Any]) -> dict[str, Any]:
     """The `options`, of this class, `seed` and frozen parts that a checkpoint was trained with, as plain values.
 
     Raises:
@@ -51,7 +55,7 @@ def checkpoint_options(path: str | Path, cls: type[TrainModelOptions] | type[Pol
         saved = torch.load(path, map_location="cpu", weights_only=True)["hyper_parameters"]
         return {
             "options": _plain(cls, saved["options"], "options"),
-            "seed": build_section(Params, {"seed": saved["seed"]}, "").seed,
+            "seed": build(Params, {"seed": saved["seed"]}, "").seed,
             "freeze": _parts(saved["freeze"]),
         }
     except FileNotFoundError:
@@ -81,7 +85,7 @@ def _architecture(folder: str | Path, cls: type, values: Mapping[str, Any]) -> d
 
 def _plain(cls: type, values: Any, section: str) -> dict[str, Any]:
     """Nested dictionaries, lists, numbers and strings of an options class, and nothing else."""
-    return json.loads(json.dumps(asdict(build_section(cls, values, section))))  # tuples become lists
+    return json.loads(json.dumps(asdict(build(cls, values, section))))  # tuples become lists
 
 
 def _parts(freeze: Any) -> list[str]:

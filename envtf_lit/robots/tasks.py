@@ -7,13 +7,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
 from envtf_lit.errors import UserError, did_you_mean
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # torch takes seconds to import, and names and options are read without it
     import gymnasium
+    from torch import Tensor
 
 VELOCITY_LIMIT = 10.0  # beyond which some robots' velocities are observed as that
 TIERS = ("random", "medium", "medium-replay", "medium-expert", "full-replay")
@@ -35,11 +33,11 @@ def quiet_mujoco() -> Iterator[None]:
         mujoco.set_mju_user_warning(None)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _all_below(observation: Tensor, limit: float) -> Tensor:
+def _all_below(observation: "Tensor", limit: float) -> "Tensor":
     return (observation.abs() < limit).all(-1)
 
 
-def hopper_terminated(observation: Tensor) -> Tensor:
+def hopper_terminated(observation: "Tensor") -> "Tensor":
     """Hopper-v5's unhealthy test: height <= 0.7, |pitch| >= 0.2, or any later coordinate beyond 100 in size.
 
     The copies of this rule in MOPO, RAMBO and their descendants apply the size test to a boolean, so that values
@@ -50,21 +48,21 @@ def hopper_terminated(observation: Tensor) -> Tensor:
     return ~healthy
 
 
-def walker2d_terminated(observation: Tensor) -> Tensor:
+def walker2d_terminated(observation: "Tensor") -> "Tensor":
     """Walker2d-v5's unhealthy test: height outside (0.8, 2.0) or |pitch| >= 1."""
     height, pitch = observation[..., 0], observation[..., 1]
     return ~((height > 0.8) & (height < 2.0) & (pitch.abs() < 1.0))
 
 
-def ant_terminated(observation: Tensor) -> Tensor:
+def ant_terminated(observation: "Tensor") -> "Tensor":
     """Ant-v5's unhealthy test: a non-finite state or a torso height outside [0.2, 1.0]."""
     height = observation[..., 0]
-    return ~(torch.isfinite(observation).all(-1) & (height >= 0.2) & (height <= 1.0))
+    return ~(observation.isfinite().all(-1) & (height >= 0.2) & (height <= 1.0))
 
 
-def never_terminated(observation: Tensor) -> Tensor:
+def never_terminated(observation: "Tensor") -> "Tensor":
     """HalfCheetah-v5 has no unhealthy state, and of a robot that is none of ours no rule is known."""
-    return torch.zeros(observation.shape[:-1], dtype=torch.bool, device=observation.device)
+    return observation.new_zeros(observation.shape[:-1]).bool()
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ class Robot:
     action_dim: int
     return_random: float
     return_expert: float
-    terminated: Callable[[Tensor], Tensor]  # next observation (..., S) -> bool (...)
+    terminated: "Callable[[Tensor], Tensor]"  # next observation (..., S) -> bool (...)
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     action_limit: float = 1.0  # actions lie in [-limit, limit]
     max_episode_steps: int = 1000
@@ -112,7 +110,7 @@ class Robot:
         """Whether friction, mass and actuator strength are drawn anew in each episode, unobserved."""
         return self.variant == "-hidden"
 
-    def clipped(self, observations: Tensor) -> Tensor:
+    def clipped(self, observations: "Tensor") -> "Tensor":
         """(...) bool, whether observations (..., S) may hide larger velocities than they show."""
         first = self.observation_dim if self.clipped_from is None else self.clipped_from
         return (observations[..., first:].abs() >= VELOCITY_LIMIT).any(-1)

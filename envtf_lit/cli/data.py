@@ -1,0 +1,50 @@
+"""`envtf data`: looks at a dataset, and writes it in another format."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from envtf_lit.cli.command import run_command
+from envtf_lit.cli.output import console
+
+Source = Annotated[str, "IN"]
+Target = Annotated[str, "OUT"]
+
+
+def check(source: Source, /, *, task: str | None = None) -> None:
+    """Prints what a dataset holds; exits with status 2 where it cannot be used.
+
+    Args:
+        source: HDF5 or NPZ file, minari:ID, or a Minari dataset's folder.
+        task: robot and tier that the data came from, such as hopper-medium.
+    """
+    from envtf_lit.data.inspection import inspect_source, render
+
+    inspection = inspect_source(source, task=task)
+    console().print(render(inspection))
+    if not inspection.usable:
+        raise SystemExit(2)
+
+
+def convert(source: Source, target: Target, /, *, task: str | None = None) -> None:
+    """Writes a dataset in another format.
+
+    Args:
+        source: HDF5 or NPZ file, minari:ID, or a Minari dataset's folder.
+        target: a new file ending in .h5, .hdf5 or .npz, or minari:ID.
+        task: robot and tier that the data came from, such as hopper-medium.
+    """
+    from envtf_lit.data import conversion
+
+    dataset, findings = conversion.convert(source, target, task=task)
+    out = console()
+    out.print(f"Wrote {len(dataset):,} transitions to {target}")
+    for finding in findings:
+        out.print(f"{finding.kind}: {finding}")
+
+
+FUNCTIONS = {"data check": check, "data convert": convert}
+
+
+def run(name: str, words: Sequence[str]) -> None:
+    """Runs `envtf data check` or `envtf data convert`."""
+    run_command(FUNCTIONS[name], name, words)

@@ -1,0 +1,51 @@
+"""`envtf init`, `envtf params` and `envtf doctor`: what helps around the pipeline."""
+
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+
+from envtf_lit.cli.command import Folder, run_command
+from envtf_lit.cli.output import console
+
+
+def init(folder: Folder, /, *, preset: str = "small") -> None:
+    """Writes a new project.
+
+    Args:
+        folder: created if missing; must not hold a dvc.yaml.
+        preset: tiny, small, base or paper.
+    """
+    from envtf_lit.project.template import write_project
+
+    kept = write_project(folder, preset)
+    if kept:
+        console().print(f"Left as they were: {', '.join(kept)}")
+    first = "" if find_spec("dvc") else "pip install 'envtf-lit[pipeline]' && "
+    console().print(f"Wrote a project to {folder}. Next: {first}cd {folder} && dvc repro")
+
+
+def params(*, preset: str = "small") -> None:
+    """Prints a complete params.yaml.
+
+    Args:
+        preset: tiny, small, base or paper.
+    """
+    from envtf_lit.pipeline.yaml import params_yaml, preset_params
+
+    sys.stdout.write(params_yaml(preset_params(preset)))
+
+
+def doctor() -> None:
+    """Prints what a bug report needs to know of this machine."""
+    from envtf_lit.project.doctor import report
+
+    for name, value in report().items():
+        console().print(f"{name:<16} {value}")
+
+
+FUNCTIONS = {"init": init, "params": params, "doctor": doctor}
+
+
+def run(name: str, words: Sequence[str]) -> None:
+    """Runs `envtf init`, `envtf params` or `envtf doctor`."""
+    run_command(FUNCTIONS[name], name, words)

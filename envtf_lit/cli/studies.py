@@ -1,0 +1,227 @@
+"""The measurements: of horizons, calibration, hidden dynamics, speed and cost."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from envtf_lit.cli.command import CORES, File, Folder, Natural, Positive, Robot, run_command
+from envtf_lit.cli.output import console, hush_lightning
+from envtf_lit.errors import UserError
+
+if TYPE_CHECKING:
+    from envtf_lit.studies.suite import SuiteOptions
+
+Models = Annotated[tuple[str, ...], "NAME=FOLDER"]
+Device = Annotated[str, "NAME"]
+
+ROBOTS: tuple[Robot, ...] = ("hopper", "halfcheetah", "walker2d", "ant")
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a command that compares the suite of world models is asked for; it trains those that are not there.
+
+    Attributes:
+        work: where they lie.
+        transitions: rows of data.
+        updates: of the transformers.
+        windows: of --context steps per update of theirs.
+        ensemble_updates: of the ensemble at most.
+        context: steps.
+        seed: of everything random.
+        threads: CPU threads.
+        compile: run them through torch.compile, which pays on a GPU.
+        quiet: no progress bars.
+    """
+
+    work: Folder = Path(".envtf/suite")
+    transitions: Natural = 100_000
+    updates: Natural = 6_000
+    windows: Positive = 32
+    ensemble_updates: Positive = 100_000
+    context: Natural = 16
+    seed: Natural = 0
+    threads: Natural = CORES
+    compile: bool = False
+    quiet: bool = False
+
+    def options(self) -> "SuiteOptions":
+        """What the suite is made with."""
+        from envtf_lit.studies.suite import SuiteOptions
+        from envtf_lit.world_models.options import EnsembleOptions
+
+        names = ("transitions", "updates", "windows", "context", "seed", "threads", "compile")
+        most = self.ensemble_updates
+        ensemble = EnsembleOptions(updates=most, updates_per_epoch=min(EnsembleOptions().updates_per_epoch, most))
+        return SuiteOptions(ensemble=ensemble, **{name: getattr(self, name) for name in names})
+
+    def comparison(self) -> dict[str, Any]:
+        """Arguments of every `compare`."""
+        return dict(work=self.work, options=self.options(), progress=not self.quiet, report=console().print)
+
+
+SHORT = Training()
+LONG = Training(context=32)
+
+
+def hidden(
+    *,
+    out: File,
+    robots: tuple[Robot, ...] = ("halfcheetah", "walker2d"),
+    tier: str = "medium-replay",
+    unseen: Natural = 100_000,
+    training: Training = LONG,
+) -> None:
+    """Measures what memory is worth where friction, mass and strength are hidden.
+
+    Args:
+        out: JSON; the figure lies beside it.
+        robots: which of the four.
+        tier: of the data.
+        unseen: rows to measure on.
+        training: of the suite.
+    """
+    from envtf_lit.studies.memory import HiddenOptions, compare
+
+    compare(out, robots=robots, tier=tier, measured=HiddenOptions(unseen), **training.comparison())
+
+
+def horizon(
+    *,
+    out: File,
+    robots: tuple[Robot, ...] = ROBOTS,
+    tier: str = "medium-replay",
+    trajectories: Natural = 300,
+    online: Natural = 100,
+    start: Natural = 0,
+    model: Models = (),
+    training: Training = SHORT,
+) -> None:
+    """Measures how long world models track reality, beside the ceiling that physics sets.
+
+    Args:
+        out: JSON; a table and a folder of figures lie beside it.
+        robots: which of the four.
+        tier: of the data.
+        trajectories: fresh episodes with recorded actions.
+        online: fresh episodes of each online policy.
+        start: steps of each episode to leave out.
+        model: a further world model; {task} and {robot} in the folder stand for their names; may be repeated.
+        training: of the suite.
+    """
+    others = _named_folders(model)
+    from envtf_lit.studies.horizon import HorizonOptions, compare
+
+    measured = HorizonOptions(trajectories, online, start)
+    compare(out, robots=robots, tier=tier, measured=measured, others=others, **training.comparison())
+
+
+def calibrate(
+    *,
+    out: File,
+    robots: tuple[Robot, ...] = ROBOTS,
+    tier: str = "medium",
+    model: Models = (),
+    training: Training = SHORT,
+) -> None:
+    """Measures what world models know of their own errors.
+
+    Args:
+        out: JSON; a table and a figure lie beside it.
+        robots: which of the four.
+        tier: of the data.
+        model: a further world model; {task} and {robot} in the folder stand for their names; may be repeated.
+        training: of the suite.
+    """
+    others = _named_folders(model)
+    from envtf_lit.studies.calibration import compare
+
+    compare(out, robots=robots, tier=tier, others=others, **training.comparison())
+
+
+def _named_folders(texts: Sequence[str]) -> dict[str, str]:
+    """What the flags `--model` say."""
+    found = dict[str, str]()
+    for text in texts:
+        name, _, folder = text.partition("=")
+        if not (name and folder):
+            raise UserError(f"--model {text!r} has no name and folder: write --model NAME=FOLDER.")
+        found[name] = folder
+    return found
+
+
+def bench_model(
+    *,
+    preset: str = "small",
+    device: Device | None = None,
+    precision: Literal["fp32", "bf16"] = "bf16",
+    compile: bool = False,
+    windows: Positive | None = None,
+    batch: Positive = 4_096,
+    horizon: Positive = 5,
+    rounds: Positive = 5,
+    seed: Natural = 0,
+    threads: Positive = CORES,
+    out: File | None = None,
+) -> None:
+    """Measures the world model's speed.
+
+    Args:
+        preset: tiny, small, base or paper.
+        device: such as cpu; default: the accelerator if there is one.
+        precision: of both sides.
+        compile: run all models through torch.compile.
+        windows: of a gradient step; default: the preset's.
+        batch: rollouts at a time.
+        horizon: steps of each.
+        rounds: of which medians are reported.
+        seed: of everything random.
+        threads: CPU threads.
+        out: JSON.
+    """
+    from envtf_lit.studies import speed
+
+    result = speed.bench_model(
+        out,
+        preset=preset,
+        device=device,
+        precision=precision,
+        compile=compile,
+        threads=threads,
+        windows=windows,
+        batch=batch,
+        horizon=horizon,
+        rounds=rounds,
+        seed=seed,
+    )
+    console().print_json(data=result)
+
+
+def bench_cost(*, task: str = "hopper-medium-replay", training: Training = SHORT, out: File | None = None) -> None:
+    """Measures what the world model's accuracy costs.
+
+    Args:
+        task: robot and tier.
+        training: of the models.
+        out: JSON.
+    """
+    from envtf_lit.studies import cost
+
+    options, progress = training.options(), not training.quiet
+    console().print_json(data=cost.bench_cost(out, task=task, work=training.work, options=options, progress=progress))
+
+
+FUNCTIONS = {
+    "hidden": hidden,
+    "horizon": horizon,
+    "calibrate": calibrate,
+    "bench model": bench_model,
+    "bench cost": bench_cost,
+}
+
+
+def run(name: str, words: Sequence[str]) -> None:
+    """Runs one of the measurements."""
+    hush_lightning()
+    run_command(FUNCTIONS[name], name, words)
