@@ -6,12 +6,12 @@ from typing import Literal
 
 import pytest
 import torch
+from envtf_lit.agents.ring import ImaginedRing
 from torch import nn
 
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.options import PolicyOptions
-from envtf_lit.agents.ring import ImaginedRing
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.options import ImaginationOptions
 from envtf_lit.imagination.rollouts import Rollouts

@@ -23,7 +23,7 @@ from envtf_lit.pipeline.yaml import load_params
 
 ROOT = Path(__file__).parent.parent
 # every stage reads its options through these, and DVC tracks the options' values themselves
-OPTIONS = {"envtf_lit.errors", "envtf_lit.options.schema", "envtf_lit.pipeline.params"}
+OPTIONS = {"envtf_lit.errors", "envtf_lit.pipeline.params"}
 
 
 def read_yaml(name: str) -> dict[str, Any]:
@@ -31,17 +31,27 @@ def read_yaml(name: str) -> dict[str, Any]:
 
 
 def stages() -> dict[str, dict[str, Any]]:
-    """dvc.yaml's stages by their full names, the foreach written out."""
-    written = {}
+    """dvc.yaml's stages by their full names, each foreach over a section of params.yaml written out."""
+    written, params = {}, read_yaml("params.yaml")
     for name, stage in read_yaml("dvc.yaml")["stages"].items():
         if "foreach" not in stage:
-            written[name] = stage
-        for key, item in stage.get("foreach", {}).items():
-            text = json.dumps(stage["do"]).replace("${key}", key)
-            for slot, value in item.items():
-                text = text.replace(f"${{item.{slot}}}", value)
-            written[f"{name}@{key}"] = json.loads(text)
+            written[name] = filled(stage, params)
+            continue
+        for key, item in params[stage["foreach"][2:-1]].items():
+            written[f"{name}@{key}"] = filled(stage["do"], params | {"key": key, "item": item})
     return written
+
+
+def filled(stage: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """A stage with the values of its `${a.b}`."""
+
+    def value(match: re.Match[str]) -> str:
+        found: Any = values
+        for name in match[1].split("."):
+            found = found[name]
+        return str(found)
+
+    return json.loads(re.sub(r"\$\{([\w.]+)\}", value, json.dumps(stage)))
 
 
 # the pipeline's own file
@@ -114,7 +124,7 @@ def imported_names(node: ast.AST) -> set[str]:
 
 
 def is_options(module: str) -> bool:
-    return module in OPTIONS or module.endswith(".options")
+    return module in OPTIONS or module.endswith(".options") or module.startswith("envtf_lit.options.")
 
 
 def modules_of(stage: str) -> set[str]:

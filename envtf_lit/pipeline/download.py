@@ -3,13 +3,15 @@
 from pathlib import Path
 from typing import Any
 
+import h5py
+
 from envtf_lit.data.cards import dataset_card
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.files import write_json
+from envtf_lit.files import replacing, write_json, write_text
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.sources import make_dataset
-from envtf_lit.pipeline.stage import CARD, DATASET, run_stage
+from envtf_lit.pipeline.stage import CARD, DATASET, NOTHING, run_stage
 from envtf_lit.robots.tasks import get_task
 
 
@@ -31,4 +33,13 @@ def download(params: Params, root: Path = Path("."), *, progress: bool = True) -
         save_dataset(dataset, root / DATASET)
         card = dataset_card(dataset, params.download.source, origin)
         write_json(root / CARD, card)
+        _write_nothing(root)
     return card
+
+
+def _write_nothing(root: Path) -> None:
+    """What policies that learn from data alone read in place of a world model and its rollouts."""
+    model, rollouts = (root / path for path in NOTHING)
+    write_text(model, "Policies whose world_model is `none` learn from data alone.\n")
+    with replacing(rollouts) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["note"] = "no rollouts: for policies whose world_model is `none`"
