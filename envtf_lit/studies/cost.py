@@ -18,6 +18,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from envtf_lit.files import pick_device, write_json
+from envtf_lit.results import claim
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.studies.machine import facts
 from envtf_lit.studies.suite import WORK, SuiteOptions, build_suite, model_params
@@ -57,8 +58,10 @@ def bench_cost(
         `MODEL_peak_memory_mb` of its process, and on an accelerator `MODEL_peak_device_memory_mb`; and the machine.
 
     Raises:
-        UserError: an unknown task, or options that contradict each other.
+        UserError: an unknown task, options that contradict each other, or `out` is there and no such result.
     """
+    if out is not None:
+        claim(out, "target_error")
     for name in ("transformer", "ensemble"):
         model_params(name, task, options)  # what is wrong with the options shows before any work
     dataset = build_suite(task, work, options, models=(), progress=progress).dataset
