@@ -417,25 +417,25 @@ def _comparison(namespace: argparse.Namespace) -> dict[str, Any]:
 
 
 def _hidden(namespace: argparse.Namespace, rest: list[str]) -> None:
-    from envtf_lit.studies.memory import HiddenOptions, compare
+    from envtf_lit.studies.memory import HiddenOptions, MemoryStudy
+    from envtf_lit.studies.study import run_study
 
-    compare(**_comparison(namespace), measured=HiddenOptions(namespace.unseen))
+    run_study(MemoryStudy(HiddenOptions(namespace.unseen)), **_comparison(namespace))
 
 
 def _horizon(namespace: argparse.Namespace, rest: list[str]) -> None:
-    from envtf_lit.studies.horizon import HorizonOptions, compare
+    from envtf_lit.studies.horizon import HorizonOptions, HorizonStudy
+    from envtf_lit.studies.study import run_study
 
-    compare(
-        **_comparison(namespace),
-        measured=HorizonOptions(namespace.trajectories, namespace.online, namespace.start),
-        others=_named_folders(namespace),
-    )
+    study = HorizonStudy(HorizonOptions(namespace.trajectories, namespace.online, namespace.start))
+    run_study(study, **_comparison(namespace), others=_named_folders(namespace))
 
 
 def _calibrate(namespace: argparse.Namespace, rest: list[str]) -> None:
-    from envtf_lit.studies.calibration import compare
+    from envtf_lit.studies.calibration import CalibrationStudy
+    from envtf_lit.studies.study import run_study
 
-    compare(**_comparison(namespace), others=_named_folders(namespace))
+    run_study(CalibrationStudy(), **_comparison(namespace), others=_named_folders(namespace))
 
 
 def _named_folders(namespace: argparse.Namespace) -> dict[str, str]:

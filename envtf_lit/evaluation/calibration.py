@@ -1,8 +1,9 @@
-"""Does a world model know what it does not know?
+"""Calibration of a world model's uncertainty: coverage, proper scores, out-of-distribution detection, rank correlation.
 
-Aleatoric and epistemic spread together are judged by predictive intervals and proper scores on held-out episodes;
-epistemic variance alone by how well it tells strange state-action pairs from familiar ones; the uncertainty u, by which
-imagined rewards are penalised, by whether it is large where the model's own rollouts are wrong, as MuJoCo says.
+Aleatoric and epistemic spread together are measured by predictive intervals and proper scores on held-out episodes;
+epistemic variance alone by how well it tells out-of-distribution state-action pairs from in-distribution ones; the
+uncertainty u, by which imagined rewards are penalised, by its rank correlation with the true error, as MuJoCo tells it,
+along the model's own rollouts.
 """
 
 import math
@@ -44,36 +45,38 @@ class Coverage:
     by_dimension: tuple[float | None, ...]
 
 
-def coverage(taught: Forecast, trajectories: Trajectories, scale: Scale, level: float) -> Coverage:
+def coverage(teacher_forced: Forecast, trajectories: Trajectories, scale: Scale, level: float) -> Coverage:
     """Share of recorded outcomes inside the central `level` interval of each one-step prediction.
 
     Args:
-        taught: the teacher-forced forecast of `horizon_report`.
+        teacher_forced: the forecast of `horizon_report` that was shown the true past.
         trajectories: what was forecast.
         scale: says which dimensions are live.
         level: in (0, 1).
     """
-    share = (normal_scores(taught, trajectories).abs() <= half_width(level)).double().mean(0)  # (S + 1,)
+    share = (normal_scores(teacher_forced, trajectories).abs() <= half_width(level)).double().mean(0)  # (S + 1,)
     live = scale.live.tolist()
     by_dimension = tuple(value if alive else None for value, alive in zip(share.tolist(), live, strict=True))
     return Coverage(level, float(share[scale.live].mean()), by_dimension)
 
 
-def recalibrated(taught: Forecast, seen: Forecast, trajectories: Trajectories) -> Forecast:
+def recalibrated(teacher_forced: Forecast, seen: Forecast, trajectories: Trajectories) -> Forecast:
     """A forecast with factors and tails that were fitted to another one of the same model, as the transformer has them.
 
     Args:
-        taught: what is to be recalibrated.
-        seen: what factors and tails are fitted to, of other episodes.
-        trajectories: what happened in these.
+        teacher_forced: the forecast to be recalibrated.
+        seen: the forecast that factors and tails are fitted to, of other episodes.
+        trajectories: these episodes, as recorded.
     """
     factor, tail = fitted(normal_scores(replace(seen, tail=None), trajectories))
-    return Forecast(taught.mean, taught.std * factor.sqrt().to(taught.std.dtype), tail)
+    return Forecast(teacher_forced.mean, teacher_forced.std * factor.sqrt().to(teacher_forced.std.dtype), tail)
 
 
 @dataclass(frozen=True)
 class ProperScores:
-    """What an honest forecast makes least, per live dimension and outcome, in z-scored units; at most 1e8.
+    """Scores that are least in expectation where the forecast is the true distribution; per live dimension and outcome.
+
+    In z-scored units, at most 1e8.
 
     Attributes:
         nll: mean negative log-density.
@@ -84,19 +87,20 @@ class ProperScores:
     crps: float
 
 
-def proper_scores(taught: Forecast, trajectories: Trajectories, scale: Scale) -> ProperScores:
+def proper_scores(teacher_forced: Forecast, trajectories: Trajectories, scale: Scale) -> ProperScores:
     """Scores of one-step predictions at the recorded outcomes, mean over live dimensions and the reward.
 
     Args:
-        taught: the teacher-forced forecast of `horizon_report`; a spread below 1e-6 z-scored units counts as that.
+        teacher_forced: the forecast of `horizon_report` that was shown the true past; a spread counts as at least 1e-6
+            z-scored units.
         trajectories: what was forecast.
         scale: the units, and which dimensions are live.
     """
-    columns = (trajectories.targets - taught.mean, taught.std)
+    columns = (trajectories.targets - teacher_forced.mean, teacher_forced.std)
     error, std = ((column[trajectories.valid] / scale.std)[:, scale.live].double() for column in columns)
     std = std.clamp(min=CONSTANT)
     z = error.nan_to_num(nan=math.inf) / std
-    tail = torch.zeros_like(scale.std) if taught.tail is None else taught.tail
+    tail = torch.zeros_like(scale.std) if teacher_forced.tail is None else teacher_forced.tail
     tail = tail[scale.live].double()
     scores = std.log() - log_density(z, tail), std * crps(z, tail)
     return ProperScores(*(min(float(score.mean()), LARGEST) for score in scores))
@@ -104,7 +108,7 @@ def proper_scores(taught: Forecast, trajectories: Trajectories, scale: Scale) ->
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """N state-action pairs, each with the real steps that led to it.
+    """N state-action pairs, each with the real steps before it.
 
     Attributes:
         observations: (N, T, S), right-padded; the last valid one is the state.
@@ -168,15 +172,19 @@ def novelties(model: WorldModel, points: Points, *, batch_size: int = 1_024) -> 
     return np.concatenate(found)
 
 
-def auroc(familiar: np.ndarray, strange: np.ndarray) -> float:
-    """Chance that a strange point scores above a familiar one, ties counting half: 0.5 is a guess, 1 is always."""
-    ranks = _ranks(np.concatenate([familiar, strange]))[len(familiar) :]
-    above = ranks.sum() - len(strange) * (len(strange) + 1) / 2
-    return float(above / (len(familiar) * len(strange)))
+def auroc(in_distribution: np.ndarray, out_of_distribution: np.ndarray) -> float:
+    """Area under the ROC curve: the chance that an out-of-distribution point scores above an in-distribution one.
+
+    Ties count half: 0.5 is a guess, 1 is always.
+    """
+    inside, outside = len(in_distribution), len(out_of_distribution)
+    ranks = _ranks(np.concatenate([in_distribution, out_of_distribution]))[inside:]
+    above = ranks.sum() - outside * (outside + 1) / 2
+    return float(above / (inside * outside))
 
 
 def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Spearman's: Pearson's correlation of the ranks, ties sharing their mean rank; 0 where either is constant."""
+    """Spearman's rank correlation: Pearson's of the ranks, ties sharing their mean rank; 0 where either is constant."""
     ranks = np.stack([_ranks(first), _ranks(second)])
     if ranks.size == 0 or (ranks.std(1) == 0).any():
         return 0.0
@@ -189,18 +197,20 @@ def _ranks(values: np.ndarray) -> np.ndarray:
     return pd.Series(values).rank().to_numpy()
 
 
-def roc_curve(familiar: np.ndarray, strange: np.ndarray, points: int = 101) -> tuple[np.ndarray, np.ndarray]:
-    """False and true alarm rates, (points,) each, as the threshold falls from above all familiar scores to below."""
+def roc_curve(
+    in_distribution: np.ndarray, out_of_distribution: np.ndarray, points: int = 101
+) -> tuple[np.ndarray, np.ndarray]:
+    """False and true positive rates, (points,) each, as the threshold falls through the in-distribution scores."""
     false = np.linspace(0.0, 1.0, points)
-    thresholds = np.quantile(familiar, 1.0 - false)
-    true = (strange[None] > thresholds[:, None]).mean(1)
+    thresholds = np.quantile(in_distribution, 1.0 - false)
+    true = (out_of_distribution[None] > thresholds[:, None]).mean(1)
     true[-1] = 1.0
     return false, true
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutErrors:
-    """M imagined steps, each judged by the simulator restarted where the model believed it was.
+    """Uncertainty and true error of M imagined steps, each held against the simulator restarted at the imagined state.
 
     Attributes:
         uncertainty: (M,) the model's u of the step.

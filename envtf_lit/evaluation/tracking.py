@@ -1,6 +1,6 @@
-"""How long world models track reality, on episodes that none was trained on, beside how long physics tracks itself.
+"""Tracking: how long a world model's forecasts stay near what really happened, on episodes it was not trained on.
 
-The metric is the paper's (its section on long-horizon rollouts), made definite: see docs/horizon.md.
+The metric is the paper's (its section on long-horizon rollouts), made definite: see docs/metrics.md.
 """
 
 import math
@@ -46,10 +46,10 @@ def fresh_episodes(task: Task, count: int, *, seed: int, workers: int = 1, progr
 
 @dataclass(frozen=True)
 class Tracking:
-    """What is reported of one model on one set of episodes.
+    """Numbers and curves of one model on one set of episodes.
 
     Attributes:
-        numbers: by name; docs/horizon.md explains them.
+        numbers: by name; docs/metrics.md explains them.
         curves: by run (`open_loop`, `teacher_forced`, `ceiling`, `ceiling_typical`): columns of `error_quartiles`, at
             some steps.
     """
@@ -76,18 +76,18 @@ def track(
         terminated: the robot's rule, of next observations (..., S).
     """
     report, lengths = horizon_report(model, trajectories, scale), trajectories.lengths
-    taught = report.teacher_forced_nmse
+    teacher_forced = report.teacher_forced_nmse
     numbers = {
         "trajectories": len(lengths),
         "mean_length": float(lengths.double().mean()),
         "one_step_nrmse": math.sqrt(min(report.nmse_one_step, LARGEST)),
-        "one_step_typical": math.sqrt(min(float(taught[trajectories.valid].median()), LARGEST)),
+        "one_step_typical": math.sqrt(min(float(teacher_forced[trajectories.valid].median()), LARGEST)),
         **_explosions(report.open_loop_nmse, trajectories, report.imagined.mean, terminated),
         **_numbers("open_loop", report.open_loop),
         **_numbers("teacher_forced", report.teacher_forced),
         **{f"open_loop_nmse_at_{h}": min(value, LARGEST) for h, value in report.median_nmse.items()},
     }
-    errors = {"open_loop": report.open_loop_nmse, "teacher_forced": taught}
+    errors = {"open_loop": report.open_loop_nmse, "teacher_forced": teacher_forced}
     return Tracking(numbers, {run: _curve(error, lengths) for run, error in errors.items()})
 
 

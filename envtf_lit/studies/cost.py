@@ -1,4 +1,4 @@
-"""`envtf bench cost`: seconds and memory that each world model takes to reach the same error on held-out episodes.
+"""The benchmark `envtf bench cost`: seconds and memory of each world model to reach the same held-out error.
 
 The transformer, the ensemble, and one plain network with as many parameters as the transformer, each trained in a
 process of its own by the recipe of its kind.
@@ -21,7 +21,7 @@ from envtf_lit.files import pick_device, write_json
 from envtf_lit.results import claim
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.studies.machine import facts
-from envtf_lit.studies.suite import WORK, SuiteOptions, build_suite, model_params
+from envtf_lit.studies.suite import WORK, SuiteOptions, budget, build_suite, model_params
 from envtf_lit.training import fit, run_folder
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.forecast import Scale, forecast, nmse, segments
@@ -93,14 +93,14 @@ def _trial(name: str, task: str, dataset: Path, root: Path, options: SuiteOption
     train = model_params("ensemble" if name == "mlp" else name, task, options).train_model
     if name == "mlp":
         train = _plain(train, robot.observation_dim, robot.action_dim)
-    data, clock, budget = window_data(str(dataset), train, seed=options.seed), Clock(), train.ensemble or train
+    data, clock, most = window_data(str(dataset), train, seed=options.seed), Clock(), budget(train)
     lit = lit_world_model(robot.observation_dim, robot.action_dim, train, options.seed, compile=options.compile)
     key = {"trial": time.time_ns(), "options": asdict(train)}  # never continued: its seconds would not be known
     fit(
         lit,
         data,
         run=run_folder(root, "bench_cost", key, []),
-        epochs=budget.updates // budget.updates_per_epoch,
+        epochs=most.updates // most.updates_per_epoch,
         precision=options.precision,
         progress=progress,
         gradient_clip=lit.gradient_clip,
@@ -139,8 +139,8 @@ class Clock(Callback):
         self.paused = time.perf_counter()
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        taught = forecast(pl_module.kept, self.stretches, feedback="recorded")  # pyright: ignore[reportArgumentType]
-        error = nmse(taught.mean, self.stretches, self.scale)[self.stretches.valid].mean()
+        forced = forecast(pl_module.kept, self.stretches, feedback="recorded")  # pyright: ignore[reportArgumentType]
+        error = nmse(forced.mean, self.stretches, self.scale)[self.stretches.valid].mean()
         self.curve.append((round(self.paused - self.begin - self.pauses, 1), float(error)))
         self.pauses += time.perf_counter() - self.paused
 

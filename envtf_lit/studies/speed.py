@@ -1,4 +1,4 @@
-"""`envtf bench model`: how fast a world model imagines and learns, beside what it would replace.
+"""The benchmark `envtf bench model`: rates of imagination and training, beside what the world model would replace.
 
 Every ratio compares two sides that take turns in one process on one machine, in the same precision. Weights are random:
 they do not change the work. Predictive distributions have tails, as those of trained models do.

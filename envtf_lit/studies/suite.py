@@ -1,7 +1,7 @@
-"""The world models that are compared throughout, trained alike on one of the zoo's datasets.
+"""A suite: the three world models that studies compare, trained on one of the zoo's datasets, and kept on disk.
 
-The transformer, the same transformer with a context of one step, and the ensemble: what is measured of world models is
-measured of these three, and models that lie there already, trained with the same settings, are not trained again.
+The transformer, the same transformer with a context of one step, and the ensemble. A model that lies there already,
+trained with the same settings, is not trained again.
 """
 
 import json
@@ -31,6 +31,7 @@ from envtf_lit.robots.tasks import Robot, Task, get_task
 from envtf_lit.studies.machine import hardware
 from envtf_lit.training import run_folder
 from envtf_lit.world_models.fit import fit_world_model
+from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.options import EnsembleOptions, ModelOptions, TrainModelOptions, check_world_model
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.uncertainty.recalibration import calibration_split
@@ -46,7 +47,7 @@ WORK = Path(".envtf/suite")  # where suites are kept unless told otherwise
 
 @dataclass(frozen=True)
 class SuiteOptions:
-    """What the models of a suite share, and their budgets.
+    """The dataset of a suite, the sizes of its models, and their budgets.
 
     Attributes:
         transitions: rows of the zoo's dataset.
@@ -73,7 +74,7 @@ class SuiteOptions:
 
 @dataclass(frozen=True)
 class Suite:
-    """Trained models on disk; `load_world_model(suite.folders[name])` gives one.
+    """A dataset and the world models trained on it, on disk; `load_world_model(suite.folders[name])` gives one.
 
     Attributes:
         task: robot and tier.
@@ -94,19 +95,24 @@ class Suite:
     updates: dict[str, int]
 
     @property
+    def home(self) -> Path:
+        """The folder of all that belongs to the task: data, models, results of studies."""
+        return self.dataset.parents[1]
+
+    @property
     def costs(self) -> dict[str, float]:
         """`robot.model.train_seconds` and `robot.model.updates` of every model."""
         kinds = {"train_seconds": self.seconds, "updates": self.updates}
         return {f"{self.robot.name}.{name}.{kind}": value for kind, by in kinds.items() for name, value in by.items()}
 
     def split(self) -> tuple[OfflineDataset, OfflineDataset | None, OfflineDataset]:
-        """The episodes that every model was trained on, calibrated on (if there are any), and neither."""
+        """The episodes for training, for calibration (None if there are too few), and for testing, of every model."""
         training, held_out = load_dataset(self.dataset).split(TrainModelOptions().held_out, seed=self.options.seed)
         return training, *calibration_split(held_out)
 
 
 def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
-    """What a comparison's numbers depend on beside the models, under flat keys: `tier`, `suite.…`, `versions.…`.
+    """The settings of a study, under flat keys: `tier`, `suite.…`, `versions.…`, and the study's own options.
 
     Args:
         tier: of the data.
@@ -122,25 +128,28 @@ def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str
     }
 
 
-def heading(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
-    """What stands at the head of a comparison's file: `flat_settings`, `suite.ensemble.…` and `machine.…`.
+def result_header(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
+    """The first keys of a study's JSON file: `flat_settings`, `suite.ensemble.…` and `machine.…`.
 
-    `kept` asks for neither of the latter: the models' bytes tell how they were trained, and the machine hardly counts.
+    `cached_result` asks for neither of the latter: the models' bytes tell how they were trained, and the machine hardly
+    counts.
     """
     ensemble = {f"suite.ensemble.{name}": value for name, value in _plain(asdict(options.ensemble)).items()}
     machine = {f"machine.{name}": value for name, value in hardware(pick_device()).items()}
     return flat_settings(tier, options, **measured) | ensemble | machine
 
 
-def kept(home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path], measure: Callable[[], Any]) -> Any:
-    """What a measurement gives, as JSON has it: now, or when it was made with these settings on the same inputs.
+def cached_result(
+    home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path], measure: Callable[[], Any]
+) -> Any:
+    """The result of a measurement, as JSON has it: read if it was made with these settings on the same inputs.
 
     Args:
-        home: folder below which it is kept.
+        home: folder below which results are kept.
         name: of the measurement.
         settings: as `flat_settings` has them.
         inputs: files and folders whose bytes count.
-        measure: makes it.
+        measure: called where there is no such result yet.
     """
     place = run_folder(home, name, settings, inputs).with_suffix(".json")
     if not place.exists():
@@ -148,13 +157,13 @@ def kept(home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path]
     return read_json(place)
 
 
-def measurable(folder: Path, options: SuiteOptions) -> Any:
-    """A world model as it is measured: on the accelerator if there is one, through torch.compile if the suite is."""
+def load_for_study(folder: Path, options: SuiteOptions) -> WorldModel:
+    """The world model in a folder, on the accelerator if there is one, through torch.compile if the suite is."""
     return load_world_model(folder, fused=options.compile).to(pick_device())
 
 
 def other_folders(others: Mapping[str, str], tasks: Sequence[Task]) -> dict[str, dict[str, Path]]:
-    """Folders of models that are none of the suite's, by task and name; each is read, so that none fails hours later.
+    """Folders of models beside the suite's, by task and name; each is read once, so that none fails hours later.
 
     Args:
         others: name to folder; `{task}` and `{robot}` in a folder stand for those names.
@@ -224,7 +233,7 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
         UserError: options that contradict each other.
     """
     check_world_model(options)
-    home, shared = suite.dataset.parents[1], suite.options
+    home, shared = suite.home, suite.options
     params = replace(Params(), task=suite.task, train_model=options, **_common(shared))
     key = {"task": suite.task, "transitions": shared.transitions, **{name: getattr(shared, name) for name in SHARED}}
     key |= {"train_model": _plain(asdict(options)), "dataset": sha256(suite.dataset)}
@@ -238,7 +247,12 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
         older["dataset"] = key["dataset"]
     suite.seconds[name] = _unless_done(record, suite.folders[name], key, train, older)
     epochs = len((suite.folders[name] / "curves.csv").read_text().splitlines()) - 1  # the first line names columns
-    suite.updates[name] = epochs * (options.ensemble or options).updates_per_epoch
+    suite.updates[name] = epochs * budget(options).updates_per_epoch
+
+
+def budget(options: TrainModelOptions) -> TrainModelOptions | EnsembleOptions:
+    """The options that hold `updates` and `updates_per_epoch` of the kind of model that is trained."""
+    return options.ensemble or options
 
 
 def _plain(options: dict[str, Any]) -> dict[str, Any]:
@@ -247,7 +261,7 @@ def _plain(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _common(options: SuiteOptions) -> dict[str, Any]:
-    """What the stages' parameters take over from the suite's."""
+    """The pipeline's parameters that a suite sets: `SHARED`, and the size of the dataset."""
     download = DownloadOptions(transitions=options.transitions)
     return {name: getattr(options, name) for name in SHARED} | {"download": download}
 
