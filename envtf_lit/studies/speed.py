@@ -84,53 +84,66 @@ def bench_model(
     """
     if out is not None:
         claim(out, "train_fraction_of_matmul_peak")
-    place, options, body = bench_device(device), preset_params(preset).train_model, ROBOTS[robot]
-    options = replace(options, batch_size=windows or options.batch_size)
+    place, body, preset_options = bench_device(device), ROBOTS[robot], preset_params(preset).train_model
+    options = replace(preset_options, batch_size=windows or preset_options.batch_size)
     warm_up = 3 if compile else 1  # what is compiled is compiled again for other shapes, and recorded at its second run
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     with torch.no_grad(), autocast(place, precision), _simulators(body, threads) as simulators:
         actions = _imagination(body, options, place, batch, horizon, compile)
-        actions |= _cache(body, options, place, batch, compile)
-        actions |= {"real": lambda: _real(simulators, threads, real_steps)}
+        actions["real"] = lambda: _real(simulators, threads, real_steps)
         timings = in_turns(actions, rounds, warm_up=warm_up)
     del actions  # full caches, which training would have to share a GPU's memory with
-    train, flops = _training(body, options, place, precision, updates, compile)
-    learning = in_turns({"train": train, "matmul": _matmul(place, precision)}, rounds, warm_up=warm_up)
-    steps, tokens = batch * horizon, updates * options.batch_size * options.model.context
-    size, repeats = _matmul_size(place)
-    result: dict[str, Any] = {
-        "imagined_per_second": steps / typical(timings, "short"),
-        "imagined_per_second_full": steps / typical(timings, "full"),
-        "imagined_per_second_from_history": steps / typical(timings, "history"),
-        "imagined_per_second_from_shared_history": steps / typical(timings, "shared"),
-        "ensemble_per_second": steps / typical(timings, "ensemble"),
-        f"{robot}_steps_per_second": threads * real_steps / typical(timings, "real"),
-        "ratio_vs_ensemble_short": ratio(timings, "ensemble", "short"),
-        "ratio_vs_ensemble_full": ratio(timings, "ensemble_steps", "full"),
-        f"ratio_vs_{robot}": ratio(timings, "real", "short") * steps / (threads * real_steps),
-        "ratio_vs_uncached": ratio(timings, "uncached", "cached"),
-        "train_tokens_per_second": tokens / typical(learning, "train"),
-        "matmul_peak_gflops": 2e-9 * size**3 * repeats / typical(learning, "matmul"),
-        "train_fraction_of_matmul_peak": ratio(learning, "matmul", "train") * tokens * flops / (2 * size**3 * repeats),
-        "preset": preset,
-        "batch": batch,
-        "horizon": horizon,
-        "context": options.model.context,
-        "windows": options.batch_size,
-        "compile": compile,
-        "seed": seed,
-        **facts(place, precision),
-    }
+    result = _imagination_rates(robot, timings, batch * horizon, threads * real_steps)
+    result |= _learning_rates(body, options, place, precision, updates, compile, rounds, warm_up)
+    result |= dict(preset=preset, batch=batch, horizon=horizon, context=options.model.context)
+    result |= dict(windows=options.batch_size, compile=compile, seed=seed) | facts(place, precision)
     if out is not None:
         write_json(out, result)
     return result
 
 
+def _imagination_rates(robot: str, timings: list[dict[str, float]], steps: int, real_steps: int) -> dict[str, Any]:
+    """Steps per second, and ratios of rates, where a round imagines `steps` and simulates `real_steps`."""
+    return {
+        "imagined_per_second": steps / typical(timings, "short"),
+        "imagined_per_second_full": steps / typical(timings, "full"),
+        "imagined_per_second_from_history": steps / typical(timings, "history"),
+        "imagined_per_second_from_shared_history": steps / typical(timings, "shared"),
+        "ensemble_per_second": steps / typical(timings, "ensemble"),
+        f"{robot}_steps_per_second": real_steps / typical(timings, "real"),
+        "ratio_vs_ensemble_short": ratio(timings, "ensemble", "short"),
+        "ratio_vs_ensemble_full": ratio(timings, "ensemble_steps", "full"),
+        f"ratio_vs_{robot}": ratio(timings, "real", "short") * steps / real_steps,
+        "ratio_vs_uncached": ratio(timings, "uncached", "cached"),
+    }
+
+
+def _learning_rates(
+    robot: Robot,
+    options: TrainModelOptions,
+    device: torch.device,
+    precision: Precision,
+    updates: int,
+    compile: bool,
+    rounds: int,
+    warm_up: int,
+) -> dict[str, float]:
+    """Tokens per second of training, and the share of a matrix product's rate that they reach."""
+    train, flops = _training(robot, options, device, precision, updates, compile)
+    timings = in_turns({"train": train, "matmul": _matmul(device, precision)}, rounds, warm_up=warm_up)
+    (size, repeats), tokens = _matmul_size(device), updates * options.batch_size * options.model.context
+    return {
+        "train_tokens_per_second": tokens / typical(timings, "train"),
+        "matmul_peak_gflops": 2e-9 * size**3 * repeats / typical(timings, "matmul"),
+        "train_fraction_of_matmul_peak": ratio(timings, "matmul", "train") * tokens * flops / (2 * size**3 * repeats),
+    }
+
+
 def _imagination(
     robot: Robot, options: TrainModelOptions, device: torch.device, batch: int, horizon: int, compile: bool
 ) -> dict[str, Callable[[], float]]:
-    """Rollouts from single states by both models, and, with the transformer's cache full, their steps alone."""
+    """Rollouts from single states by both models; their steps alone, the transformer's cache full; and `_cache`."""
     S, A, context = robot.observation_dim, robot.action_dim, options.model.context
     transformer = _frozen(EnvironmentTransformer(S, A, **vars(options.model)), device, compile)
     ensemble = _frozen(EnsembleDynamics(S, A), device, compile)
@@ -150,6 +163,7 @@ def _imagination(
         "shared": rollouts(transformer, shared),
         "full": _steps(transformer, transformer.init(*past), actor, horizon, device),
         "ensemble_steps": _steps(ensemble, ensemble.init(*single), actor, horizon, device),
+        **_cache(robot, options, device, batch, compile),
     }
 
 
