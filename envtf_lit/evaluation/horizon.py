@@ -85,7 +85,7 @@ class HorizonReport:
         median_nmse: open loop, by step h, over the trajectories that last so long.
         explosion_rate: share of trajectories whose open-loop nmse exceeds 10 or is not finite at some step.
         trajectories: what was forecast.
-        imagined, taught: the open-loop and the teacher-forced forecast.
+        open_loop_forecast, teacher_forced_forecast: of the trajectories.
         open_loop_nmse, teacher_forced_nmse: (B, T), meaningless in the padding.
     """
 
@@ -95,8 +95,8 @@ class HorizonReport:
     median_nmse: dict[int, float]
     explosion_rate: float
     trajectories: Trajectories
-    imagined: Forecast
-    taught: Forecast
+    open_loop_forecast: Forecast
+    teacher_forced_forecast: Forecast
     open_loop_nmse: Tensor
     teacher_forced_nmse: Tensor
 
@@ -105,9 +105,9 @@ def horizon_report(
     model: WorldModel, trajectories: Trajectories, scale: Scale, *, thresholds: Sequence[float] = THRESHOLDS
 ) -> HorizonReport:
     """Forecasts every trajectory open loop and teacher-forced and sums up the errors."""
-    imagined = forecast(model, trajectories, feedback="imagined")
-    taught = forecast(model, trajectories, feedback="recorded")
-    free, forced = (nmse(run.mean, trajectories, scale) for run in (imagined, taught))
+    open_loop = forecast(model, trajectories, feedback="imagined")
+    teacher_forced = forecast(model, trajectories, feedback="recorded")
+    free, forced = (nmse(run.mean, trajectories, scale) for run in (open_loop, teacher_forced))
     lengths, valid = trajectories.lengths, trajectories.valid
     reached = [h for h in HORIZONS if bool((lengths >= h).any())]
     return HorizonReport(
@@ -117,8 +117,8 @@ def horizon_report(
         median_nmse={h: float(np.median(free[lengths >= h, h - 1].cpu().numpy())) for h in reached},
         explosion_rate=float(((free > EXPLODED) & valid).any(1).double().mean()),
         trajectories=trajectories,
-        imagined=imagined,
-        taught=taught,
+        open_loop_forecast=open_loop,
+        teacher_forced_forecast=teacher_forced,
         open_loop_nmse=free,
         teacher_forced_nmse=forced,
     )

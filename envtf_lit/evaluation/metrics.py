@@ -37,7 +37,9 @@ def world_model_metrics(report: HorizonReport, scale: Scale, *, parameters: int)
         scale: the training data's units.
         parameters: number of trainable parameters of the model.
     """
-    covered = {level: coverage(report.taught, report.trajectories, scale, level).mean for level in (0.5, 0.9)}
+    covered = {
+        level: coverage(report.teacher_forced_forecast, report.trajectories, scale, level).mean for level in (0.5, 0.9)
+    }
     return {
         "parameters": parameters,
         "nmse_one_step": report.nmse_one_step,

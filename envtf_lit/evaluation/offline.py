@@ -63,7 +63,7 @@ def judge(
         training: gives the range of rewards and the spread of actions.
     """
     held_out = report.trajectories
-    promised = (_bounded(report.imagined.mean[..., -1], training) * held_out.valid).sum(1)
+    promised = (_bounded(report.open_loop_forecast.mean[..., -1], training) * held_out.valid).sum(1)
     return Promises(
         recorded=held_out.targets[..., -1].double().sum(1).cpu().numpy(),
         promised=promised.cpu().numpy(),

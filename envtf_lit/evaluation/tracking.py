@@ -82,7 +82,7 @@ def track(
         "mean_length": float(lengths.double().mean()),
         "one_step_nrmse": math.sqrt(min(report.nmse_one_step, LARGEST)),
         "one_step_typical": math.sqrt(min(float(teacher_forced[trajectories.valid].median()), LARGEST)),
-        **_explosions(report.open_loop_nmse, trajectories, report.imagined.mean, terminated),
+        **_explosions(report.open_loop_nmse, trajectories, report.open_loop_forecast.mean, terminated),
         **_numbers("open_loop", report.open_loop),
         **_numbers("teacher_forced", report.teacher_forced),
         **{f"open_loop_nmse_at_{h}": min(value, LARGEST) for h, value in report.median_nmse.items()},

@@ -15,7 +15,10 @@ from envtf_lit.world_models.forecast import Scale
 
 def horizon_errors(report: HorizonReport, path: str | Path) -> Path:
     """Median and quartiles of the nmse by step: open loop and teacher-forced, in panels of their own."""
-    runs = {"open loop": (report.open_loop_nmse, "imagined"), "teacher-forced": (report.teacher_forced_nmse, "taught")}
+    runs = {
+        "open loop": (report.open_loop_nmse, "imagined"),
+        "teacher-forced": (report.teacher_forced_nmse, "teacher_forced"),
+    }
     tables = []
     with drawing(path, (10.5, 4.0), 1, 2) as (figure, axes):
         for axis, (name, (error, colour)) in zip(axes.flat, runs.items(), strict=True):
@@ -46,7 +49,9 @@ def one_step_predictions(report: HorizonReport, robot: str | None, path: str | P
     """Predicted against recorded one-step changes of featured dimensions, and the reward, at evenly spaced steps."""
     valid, observations = report.trajectories.valid, report.trajectories.observations
     chosen = np.unique(np.linspace(0, int(valid.sum()) - 1, points).astype(int))
-    recorded, predicted = (x[valid][chosen].cpu().numpy() for x in (report.trajectories.targets, report.taught.mean))
+    recorded, predicted = (
+        x[valid][chosen].cpu().numpy() for x in (report.trajectories.targets, report.teacher_forced_forecast.mean)
+    )
     before = observations[valid][chosen].cpu().numpy()
     size = before.shape[-1]
     labels = [f"change of {name}" for name in observation_labels(robot, size)]
@@ -71,8 +76,8 @@ def one_step_predictions(report: HorizonReport, robot: str | None, path: str | P
 def calibration_curve(report: HorizonReport, scale: Scale, robot: str | None, path: str | Path) -> Path:
     """Observed against nominal coverage of central intervals (left), and each dimension's at 50 and 90 per cent."""
     levels = np.linspace(0.05, 0.95, 19)
-    observed = [coverage(report.taught, report.trajectories, scale, level).mean for level in levels]
-    halves, most = (coverage(report.taught, report.trajectories, scale, level) for level in (0.5, 0.9))
+    observed = [coverage(report.teacher_forced_forecast, report.trajectories, scale, level).mean for level in levels]
+    halves, most = (coverage(report.teacher_forced_forecast, report.trajectories, scale, level) for level in (0.5, 0.9))
     labels = [*observation_labels(robot, len(scale.std) - 1), "reward"]
     names = [
         name.partition(" (")[0] for name, share in zip(labels, halves.by_dimension, strict=True) if share is not None
@@ -109,7 +114,7 @@ def traces(report: HorizonReport, robot: str | None, path: str | Path, *, steps:
     end = min(int(lengths[row]), steps)
     recorded, mean, std = (
         x[row, :end].cpu().numpy()
-        for x in (report.trajectories.targets, report.imagined.mean, report.imagined.std)
+        for x in (report.trajectories.targets, report.open_loop_forecast.mean, report.open_loop_forecast.std)
     )  # fmt: skip
     labels, h = observation_labels(robot, recorded.shape[-1] - 1), np.arange(1, end + 1)
     tables = []

@@ -25,7 +25,7 @@ COLOURS = {
     "recorded": "#333333",
     "promised": "#D55E00",
     "imagined": "#D55E00",
-    "taught": "#56B4E9",
+    "teacher_forced": "#56B4E9",
     "threshold": "#999999",
     "transformer": "#D55E00",
     "context_1": "#56B4E9",
