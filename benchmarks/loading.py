@@ -1,4 +1,4 @@
-"""Do data reach the learners in time, and what memory does a large log cost: `python benchmarks/loading.py [OUT.json]`.
+"""Loading: milliseconds per batch, and the memory that a large log costs: `python benchmarks/loading.py [OUT.json]`.
 
 Writes a log of 2,000,000 rows with the dimensions of Ant-105 (1.8 GB) and one of 20,000 into a temporary folder, and
 trains the small preset's world model and agent on both, each in a process of its own. Prints the milliseconds that a
