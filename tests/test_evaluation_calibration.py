@@ -190,8 +190,8 @@ def test_points_are_late_pairs_with_the_steps_before_them():
     rows = [10, 11, 30, 31, 32, 33, 34]
     assert points.lengths.tolist() == [4] * 7
     for i, row in enumerate(rows):
-        np.testing.assert_array_equal(points.observations[i], log.observations[row - 3 : row + 1])
-        np.testing.assert_array_equal(points.past_actions[i], log.actions[row - 3 : row])
+        np.testing.assert_array_equal(points.histories.observations[i], log.observations[row - 3 : row + 1])
+        np.testing.assert_array_equal(points.histories.actions[i], log.actions[row - 3 : row])
         np.testing.assert_array_equal(points.actions[i], log.actions[row])
     assert len(draw_points(log, 4, history=3, seed=0).actions) == 4
     with pytest.raises(UserError, match="No episode has more than 10 steps"):
@@ -202,7 +202,7 @@ def test_uniform_actions_replace_the_last_action_alone():
     log = random_log((60, 60))
     points = draw_points(log, 100, history=3, seed=0)
     other = with_uniform_actions(points, log.action_low, log.action_high, seed=0)
-    assert torch.equal(other.observations, points.observations) and torch.equal(other.past_actions, points.past_actions)
+    assert torch.equal(other.histories.observations, points.histories.observations) and torch.equal(other.histories.actions, points.histories.actions)
     assert other.actions.dtype == torch.float32
     assert -2 <= other.actions.min() < -1.8 and 2.8 < other.actions.max() <= 3
     assert not torch.isclose(other.actions, points.actions).any()
@@ -214,9 +214,9 @@ def test_novelty_is_that_of_the_last_token_after_the_true_past():
     points = draw_points(log, 7, history=5, seed=0)  # the model's context is 6
     assert model.laplace is not None and model.random_features is not None
     with torch.no_grad():
-        actions = torch.cat([points.past_actions, points.actions[:, None]], 1)
-        hidden, _ = model.encode(points.observations, actions, cached=False)
-        random = model.random_features(model.normaliser.token(points.observations[:, -1], points.actions))
+        actions = torch.cat([points.histories.actions, points.actions[:, None]], 1)
+        hidden, _ = model.encode(points.histories.observations, actions, cached=False)
+        random = model.random_features(model.normaliser.token(points.histories.observations[:, -1], points.actions))
         expected = model.laplace.leverage(torch.cat([hidden[:, -1], random], -1)) / model.laplace.limit
     found = novelties(model, points, batch_size=3)
     assert found is not None
