@@ -107,7 +107,7 @@ def test_a_dataset_without_its_card_is_unfinished(out: Path, monkeypatch: pytest
         patch.setattr(zoo_module, "card_page", interrupt)
         with pytest.raises(KeyboardInterrupt):
             build_again(out, ["hopper-random", "hopper-medium"], transitions=320)
-    assert not (out / "hopper-random.json").exists()
+    assert json.loads((out / "hopper-random.json").read_text()) == {"source": "zoo", "task": "hopper-random"}
     assert not list(out.glob(".*partial"))
     table = build_again(out, ["hopper-random"])
     assert [entry.transitions for entry in table if entry.task == "hopper-random"] == [300]
@@ -131,6 +131,16 @@ def test_cards_of_other_datasets_in_the_folder_are_left_alone(tmp_path: Path) ->
         (tmp_path / f"{name}.h5").write_bytes((tmp_path / "hopper-random.h5").read_bytes())
         (tmp_path / f"{name}.json").write_text(json.dumps(card))
     assert [entry.task for entry in build_again(tmp_path, ["hopper-random"])] == ["hopper-random"]
+
+
+@pytest.mark.parametrize(
+    "name", ["hopper-random.h5", "hopper-random.json", "hopper-random.md", "index.json", "index.md", "returns.csv"]
+)
+def test_files_that_are_none_of_the_zoos_are_named_and_stay(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("[1]")
+    with pytest.raises(UserError, match=rf"{name} would be replaced, and is none of what `zoo build` has made here"):
+        build_again(tmp_path, ["hopper-medium", "hopper-random"])
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: "[1]"}
 
 
 def test_a_folder_that_cannot_be_made_and_a_negative_seed_are_refused(

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ from envtf_lit.data.cards import card_page, dataset_card, dataset_scores, markdo
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.files import read_json, write_json, write_text
+from envtf_lit.results import has, read_or_none, refuse_others
 from envtf_lit.robots.tasks import ROBOTS, TASKS, Task, get_task
 from envtf_lit.zoo.collect import collect
 from envtf_lit.zoo.snapshots import NOT_D4RL, Series, describe_origin, plan, read_series
@@ -64,13 +65,15 @@ def build(
         The table of all datasets in the folder.
 
     Raises:
-        UserError: no task is given, one is unknown, `transitions` is too small for one, or `out` cannot be made.
+        UserError: no task is given, one is unknown, `transitions` is too small for one, `out` cannot be made, or
+            files that are none of the zoo's have the names of its own.
     """
     wanted = [get_task(name) for name in dict.fromkeys(tasks)]
     if not wanted:
         raise UserError("No task is named: give some, such as hopper-medium, or --all.")
     for task in wanted:
         plan(task, transitions, read_series(task.robot, zoo))  # complains before the first is begun
+    _claim(wanted, out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -89,6 +92,19 @@ def build(
     return entries
 
 
+def _claim(tasks: Sequence[Task], out: Path) -> None:
+    """Raises UserError if there are files of the names to be written, and nothing that says they are the zoo's."""
+    words = "none of what `zoo build` has made here; move it, or choose another --out"
+    for task in tasks:
+        card = read_or_none(out / f"{task.name}.json")
+        if not (has(card, "source", "task") and (card["source"], card["task"]) == ("zoo", task.name)):
+            refuse_others((out / f"{task.name}{ending}" for ending in (".h5", ".json", ".md")), words)
+    rows, names = read_or_none(out / INDEX), [field.name for field in fields(Entry)]
+    if not (isinstance(rows, list) and all(has(row, *names) for row in rows)):
+        beside = (Path(INDEX).with_suffix(".md"), FIGURE, Path(FIGURE).with_suffix(".csv"))
+        refuse_others((out / name for name in (INDEX, *beside)), words)
+
+
 def _is_made(task: Task, out: Path, origin: dict[str, Any]) -> bool:
     card = out / f"{task.name}.json"
     return card.exists() and (out / f"{task.name}.h5").exists() and origin.items() <= read_json(card).items()
@@ -99,7 +115,7 @@ def _make(
 ) -> Entry:
     begin = time.perf_counter()
     path = out / f"{task.name}.h5"
-    path.with_suffix(".json").unlink(missing_ok=True)  # a card says that its dataset is whole
+    write_json(path.with_suffix(".json"), {"source": "zoo", "task": task.name})  # ours, and not yet whole
     dataset = collect(task, transitions, seed=seed, workers=workers, zoo=zoo, progress=progress)
     save_dataset(dataset, path)
     card = dataset_card(dataset, "zoo", describe_origin(task, transitions, seed, zoo))
