@@ -132,6 +132,21 @@ def test_settling_averages_the_late_snapshots_and_calms_them(
         settle(HOPPER, tmp_path)
 
 
+def test_settling_that_is_interrupted_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(behaviour_training, "EPISODES", 1)
+    shutil.copytree(ZOO / "hopper", tmp_path / "hopper")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "hopper").iterdir()}
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(behaviour_training, "write_json", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        settle(HOPPER, tmp_path)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "hopper").iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["hopper"]
+
+
 @pytest.mark.parametrize(("last", "noise"), [(0, 0.5), (1_000, 0.5), (3, 0.0)])
 def test_settling_refuses_what_cannot_be(tmp_path: Path, last: int, noise: float) -> None:
     shutil.copytree(ZOO / "hopper", tmp_path / "hopper")

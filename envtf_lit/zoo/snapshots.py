@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from envtf_lit.errors import UserError
-from envtf_lit.files import load_weights, read_json
+from envtf_lit.files import load_weights, read_json, recover
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.robots.hidden_dynamics import HIGH, LOW
 from envtf_lit.robots.tasks import ROBOTS, Robot, Task
@@ -83,6 +83,7 @@ def read_series(robot: Robot, zoo: Path | None = None) -> Series:
         UserError: that folder has no (or no valid) series of this robot.
     """
     folder = (zoo or ZOO) / robot.name
+    recover(folder)
     content = read_json(folder / "zoo.json")
     try:
         snapshots = tuple(Snapshot(**snapshot) for snapshot in content["snapshots"])

@@ -2,6 +2,7 @@
 
 import math
 import os
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -95,7 +96,7 @@ def train(robot: Robot, out: Path, *, algorithm: str, steps: int, seed: int, pro
         UserError: sbx is missing, or the folder holds a series already.
     """
     folder, recipe = out / robot.name, RECIPES[algorithm]
-    if folder.exists():
+    if os.path.lexists(folder):
         raise UserError(f"{folder} exists already: name another --out, or delete it to train anew.")
     if steps <= WARM_UP_STEPS:
         raise UserError(
@@ -218,10 +219,12 @@ def settle(robot: Robot, zoo: Path, *, last: int = 3, noise: float = 0.5) -> Sna
     assert isinstance(output, torch.nn.Linear)
     output.bias.data[robot.action_dim :] += math.log(noise)
     content = read_json(series.folder / "zoo.json")
-    kept = _keep(actor, robot, series.snapshots[-1].steps, series.folder)
-    content["snapshots"][-1] = asdict(kept)
     content["trained_with"] += f"; {SETTLED} of the last {last}'s weights, with {noise:g} times the standard deviation"
-    write_json(series.folder / "zoo.json", content)
+    with replacing(series.folder) as folder:  # weights and what is said of them change together
+        shutil.copytree(series.folder, folder, symlinks=True)
+        kept = _keep(actor, robot, series.snapshots[-1].steps, folder)
+        content["snapshots"][-1] = asdict(kept)
+        write_json(folder / "zoo.json", content)
     return kept
 
 
