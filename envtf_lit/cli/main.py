@@ -536,9 +536,9 @@ def _zoo_settle(namespace: argparse.Namespace, rest: list[str]) -> None:
     from rich.console import Console
 
     from envtf_lit.robots.tasks import ROBOTS
-    from envtf_lit.zoo.train import settle
+    from envtf_lit.zoo.train import average_last_snapshots
 
     robot = ROBOTS[namespace.robot]
-    kept = settle(robot, namespace.out, last=namespace.last, noise=namespace.noise)
+    kept = average_last_snapshots(robot, namespace.out, last=namespace.last, noise=namespace.noise)
     score = robot.normalised_score(kept.mean_return)
     Console().print(f"The last snapshot now returns {kept.mean_return:.0f} (score {score:.1f}).", soft_wrap=True)
