@@ -6,10 +6,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from envtf_lit.data.columns import Column, column_blocks, moments, take
+from envtf_lit.data.columns import Column, take
+from envtf_lit.data.statistics import DatasetStatistics
 from envtf_lit.errors import UserError
 
 COLUMNS = ("observations", "actions", "rewards", "next_observations", "terminated", "truncated")
@@ -80,10 +80,15 @@ class OfflineDataset:
         """(E,) bool, the episodes that terminated or came to a limit of so many steps: others are cut short."""
         return self.terminated[self.episode_ends - 1] | (self.episode_lengths >= limit)
 
-    def observation_scale(self, floor: float = 1e-3) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation (S,) float32 for a policy's inputs; the std is at least `floor`."""
-        mean, std = moments(torch.as_tensor(self.observations[block]) for block in column_blocks(self.observations))
-        return mean.float(), std.clamp(min=floor).float()
+    @cached_property
+    def statistics(self) -> DatasetStatistics:
+        """Means, standard deviations and ranges of the columns."""
+        return DatasetStatistics(self)
+
+    def observation_scale(self) -> tuple[Tensor, Tensor]:
+        """Mean and `Moments.scale` (S,) float32, with which policies z-score their inputs."""
+        observations = self.statistics.observations
+        return observations.mean.float(), observations.scale.float()
 
     def select(self, episodes: Sequence[int] | np.ndarray) -> "OfflineDataset":
         """The dataset of these episodes, in the order given."""

@@ -98,7 +98,7 @@ def return_weights(dataset: OfflineDataset, temperature: float) -> Tensor:
     A log that is mostly poor then teaches what its best episodes did; a small temperature means a sharp preference.
     """
     returns = dataset.episode_returns
-    scaled = (returns - returns.min()) / max(returns.max() - returns.min(), 1e-9)
+    scaled = (returns - returns.min()) / (np.ptp(returns) or 1.0)  # 1: all are equal
     return torch.as_tensor(np.exp((scaled - 1.0) / temperature)[dataset.episode_index])
 
 
