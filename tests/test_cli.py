@@ -163,6 +163,16 @@ def test_a_stage_writes_its_outputs_and_prints_its_metrics(tiny_download: Path) 
     assert json.loads((tiny_download / "data" / "dataset.json").read_text())["transitions"] == 1000
 
 
+def test_download_does_not_write_over_the_file_that_it_reads(
+    tiny_download: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tiny_download)
+    before = {path: path.read_bytes() for path in (tiny_download / "data").iterdir()}
+    assert exit_status(["download", "--download.source=file", "--download.path=./data/dataset.h5"]) == 2
+    assert "move your file to another place" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in before} == before
+
+
 @pytest.mark.parametrize("kind", LIGHTNING)
 def test_lightnings_help_says_that_a_config_is_trusted(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status([kind, "--help"]) == 0

@@ -111,6 +111,9 @@ def _add_data(commands: Any) -> None:
     )
     convert.add_argument("source", metavar="IN", help="the same")
     convert.add_argument("target", metavar="OUT", help="a new file ending in .h5, .hdf5 or .npz, or minari:ID")
+    for end in ("low", "high"):
+        words = f"{end} limits of the actions, one number or one for each dimension, where the file states none"
+        convert.add_argument(f"--action_{end}", type=float, nargs="+", metavar="X", help=words)
     for command in (check, convert):
         command.add_argument("--task", help="robot and tier that the data came from, such as hopper-medium")
 
@@ -381,7 +384,8 @@ def _convert(namespace: argparse.Namespace, rest: list[str]) -> None:
 
     from envtf_lit.data.conversion import convert
 
-    dataset, findings = convert(namespace.source, namespace.target, task=namespace.task)
+    limits = {name: getattr(namespace, name) for name in ("action_low", "action_high")}
+    dataset, findings = convert(namespace.source, namespace.target, task=namespace.task, **limits)
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"Wrote {len(dataset):,} transitions to {namespace.target}", markup=False)
     for finding in findings:

@@ -261,8 +261,8 @@ class WindowData(L.LightningDataModule):
         context: steps per window; the model's context.
         batch_size: windows per batch and process.
         updates_per_epoch: batches per epoch.
-        held_out: share of the episodes kept for validation.
-        seed: of the split and of all draws.
+        held_out: share of the episodes kept for validation, where the dataset does not say which they are.
+        seed: of all draws, and of that split.
         members: of an ensemble, each of which has its own bootstrap resample of the training windows; its batches come
             first in the shape, (members, batch_size, context, …). None gives plain windows.
     """
@@ -330,8 +330,9 @@ class TransitionData(L.LightningDataModule):
         discount: of future rewards, per step.
         n_step: steps whose rewards enter the temporal-difference target.
         return_temperature: of `return_weights`; None draws rows uniformly.
-        held_out: share of the episodes left out, the ones that `WindowData` holds out with the same share and seed.
-        seed: of the split and of all draws.
+        held_out: 0 takes all episodes; more leaves out those that the dataset says are held out, else that share of
+            them, the ones that `WindowData` holds out with the same share and seed.
+        seed: of all draws, and of that split.
     """
 
     def __init__(

@@ -16,12 +16,15 @@ class DownloadOptions:
         path: the HDF5 or NPZ file of `source: file`; of `source: d4rl` a copy of its file, null downloads it.
         minari_id: of `source: minari`, such as `mujoco/hopper/medium-v0`, or its folder.
         transitions: rows to collect from the zoo.
+        held_out: share of the episodes that nothing learns from, for validation and evaluation; a file that names its
+            own keeps them.
     """
 
     source: Literal["zoo", "file", "d4rl", "minari"] = "zoo"
     path: str | None = None
     minari_id: str | None = None
     transitions: int = 100_000
+    held_out: float = 0.1
 
 
 def check_download(options: DownloadOptions, *, named: bool) -> None:

@@ -59,15 +59,16 @@ class Moments:
 
         No unit enters: a column in metres and the same one in micrometres are both live, or neither.
         """
-        return (self.std > CONSTANT * self._largest) & (self.std > SMALLEST)
+        return (self.std > CONSTANT * self.largest) & (self.std > SMALLEST)
 
     @property
     def scale(self) -> Tensor:
         """(D,) float64, what z-scores divide by: the std; of a constant dimension its magnitude, or 1 if it is 0."""
-        return torch.where(self.live, self.std, torch.where(self._largest > SMALLEST, self._largest, 1.0))
+        return torch.where(self.live, self.std, torch.where(self.largest > SMALLEST, self.largest, 1.0))
 
     @property
-    def _largest(self) -> Tensor:
+    def largest(self) -> Tensor:
+        """(D,) float64, the largest magnitude."""
         return torch.maximum(self.low.abs(), self.high.abs())
 
     def __getitem__(self, dimensions: slice) -> "Moments":
