@@ -19,10 +19,13 @@ export VIRTUAL_ENV := $(CURDIR)/.venv
 export PATH := $(VIRTUAL_ENV)/bin:$(PATH)
 unexport PYTHONHOME PYTHONPATH
 
-PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS))
+# The lock holds the same versions as constraints.txt, with hashes: it goes with no other.
+LOCK = $(if $(filter constraints.txt,$(CONSTRAINTS)),requirements.lock)
+PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check
+PINNED = $(PIP) $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) $(if $(LOCK),--no-build-isolation)
 TORCH = $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: help repro test test-all lint clean
+.PHONY: help repro test test-all lint lock clean
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | head -7
@@ -60,14 +63,26 @@ clean:
 	  { echo "make: $(PYTHON) lacks venv or ensurepip: install them (on Debian and Ubuntu: apt install python3-venv)." >&2; exit 1; }
 	@$(PYTHON) -m venv .venv
 
-.venv/.installed: .venv/bin/python pyproject.toml $(CONSTRAINTS)
+.venv/.installed: .venv/bin/python pyproject.toml $(CONSTRAINTS) $(LOCK)
 	@echo "Installing into .venv (a few minutes the first time) …"
-	@$(PIP) $(TORCH) --editable .
+	@$(if $(LOCK),$(PIP) --require-hashes --no-deps --requirement $(LOCK))
+	@$(PINNED) $(TORCH) --editable '.[pipeline]'
 	@touch $@
 
 .venv/.installed-dev: .venv/.installed
-	@$(PIP) $(TORCH) --editable '.[dev]'
+	@$(PINNED) $(TORCH) --editable '.[dev]'
 	@touch $@
+
+# Written anew after any change of constraints.txt or of the dependencies. Torch is left out with all that its builds
+# bring along; hatchling and editables build this package.
+lock: .venv/bin/python
+	@$(PINNED) uv
+	@trap 'rm -f requirements.lock.new' EXIT; \
+	  { sed '/^[^#]/,$$d' requirements.lock; \
+	  printf 'hatchling\neditables\n' | uv pip compile --quiet --universal --generate-hashes --no-header --no-annotate \
+	    --python-version 3.11.5 --constraint constraints.txt --extra pipeline pyproject.toml - | \
+	  awk '/^[^ ]/ { left_out = /^(torch|triton|cuda-[a-z]+|nvidia-[a-z0-9-]+)==/ } !left_out'; } >requirements.lock.new; \
+	  mv requirements.lock.new requirements.lock
 
 # A download without .git has no SCM for DVC to use.
 .dvc/tmp/.ready: .venv/.installed

@@ -28,7 +28,7 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import TransitionData, WindowData, Windows
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.pipeline.params import Params
-from envtf_lit.training import fit
+from envtf_lit.training import trained
 from envtf_lit.world_models.lit import LitWorldModel
 
 LARGE, SMALL = 2_000_000, 20_000
@@ -114,8 +114,20 @@ def measure(path: Path, learner: str) -> dict[str, Any]:
     loaded = loading_ms(data.train_dataloader(), steps)
     clock: list[float] = []
     setattr(module, "on_train_batch_end", lambda *_: clock.append(time.process_time()))  # noqa: B010 (a hook)
-    with tempfile.TemporaryDirectory() as folder:
-        fit(module, data, run=Path(folder), epochs=1, precision=params.precision, progress=False, validate=False)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        trained(
+            module,
+            data,
+            run=Path(folder),
+            target=None,
+            epochs=1,
+            precision=params.precision,
+            progress=False,
+            validate=False,
+        ),
+    ):
+        pass
     learned = 1000 * (clock[-1] - clock[0]) / (len(clock) - 1) - loaded
     rates = {"loading_ms": loaded, "learning_ms": learned, "ratio": learned / loaded}
     return rates | {f"{name}_mb": value for name, value in memory.look().items()}

@@ -1,4 +1,4 @@
-"""The one exception that users are meant to read, and the "did you mean" that goes with it."""
+"""The one exception that users are meant to read, and sentences that several raise or end it with."""
 
 import difflib
 import errno
@@ -12,6 +12,17 @@ class UserError(ValueError):
 
     The command line prints it without a traceback and exits with status 2.
     """
+
+
+def missing_extra(needed: str, extra: str, error: ImportError) -> UserError:
+    """What to raise where an optional package is not installed.
+
+    Args:
+        needed: such as "The report needs papermill".
+        extra: of envtf-lit, that brings it.
+        error: that its import raised.
+    """
+    return UserError(f"{needed} ({error}): pip install 'envtf-lit[{extra}]'.")
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

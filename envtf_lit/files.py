@@ -224,6 +224,25 @@ def _names(error: OSError, path: Path, target: Path, temporary: Path) -> bool:
     return Path(error.filename) in (path, target) or temporary.is_relative_to(error.filename)
 
 
+class _Rehearsed(Exception):
+    """Ends a rehearsal."""
+
+
+def check_writable(path: str | Path, *, folder: bool) -> None:
+    """Tests before long work that `replacing` will be able to put a folder, or a file, there.
+
+    Raises:
+        UserError: it will not.
+    """
+    path = Path(path)
+    if os.path.lexists(path) and path.is_dir() != folder:
+        kind = "folder" if path.is_dir() else "file" if path.exists() else "link to nowhere"
+        raise UserError(f"Cannot write {path}: a {kind} of that name stands there; move it, or choose another name.")
+    with contextlib.suppress(_Rehearsed), replacing(path) as temporary:
+        temporary.mkdir()
+        raise _Rehearsed
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Writes a whole text or nothing; raises what `replacing` does."""
     with replacing(path) as temporary:
@@ -246,7 +265,7 @@ def read_json(path: str | Path) -> Any:
         return json.loads(path.read_text())
     except FileNotFoundError:
         raise UserError(f"{path} does not exist: check the path, or run the stage that writes it.") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # the latter of brackets in brackets, the former of a long number too
         raise UserError(f"{path} is not valid JSON ({error}): write it anew.") from None
 
 

@@ -1,21 +1,26 @@
 """One way to train a LightningModule: resumable, quiet or with a progress bar, and leaving nothing half-written."""
 
+import contextlib
 import csv
 import hashlib
+import io
 import json
 import logging
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from rich.console import Console
 from torch import nn
 
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.files import replacing, write_json
+from envtf_lit.files import check_writable, replacing, write_json
 from envtf_lit.options.schema import Precision
 
 logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # says what hardware there is at every fit
@@ -70,11 +75,33 @@ class Curves(Checkpoint):
             writer.writerows(self.rows)
 
 
-def fit(
+class WholeCheckpoints(TorchCheckpointIO):
+    """Leaves the old checkpoint or the new one, whatever happens meanwhile: Lightning's own way may copy in place."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """As Lightning's, through a temporary file beside `path` that is on the disk before it takes its place.
+
+        Raises:
+            UserError: the disk is full, or the place cannot be written.
+        """
+        if "://" in str(path):  # no file of ours
+            super().save_checkpoint(checkpoint, path, storage_options)
+            return
+        buffer = io.BytesIO()
+        torch.save(checkpoint, buffer)  # so that a full disk is an OSError
+        with replacing(path) as temporary, temporary.open("wb") as stream:
+            stream.write(buffer.getbuffer())
+            stream.flush()
+            os.fsync(stream.fileno())
+
+
+@contextlib.contextmanager
+def trained(
     module: L.LightningModule,
     data: L.LightningDataModule,
     *,
     run: Path,
+    target: Path | None,
     epochs: int,
     precision: Precision,
     progress: bool = True,
@@ -83,18 +110,29 @@ def fit(
     mode: Literal["min", "max"] = "min",
     gradient_clip: float | None = None,
     callbacks: Sequence[Callback] = (),
-) -> Curves:
-    """Trains for `epochs`, resuming from `run` if a checkpoint lies there; leaves the module as it should be kept.
+) -> Iterator[Curves]:
+    """Trains for `epochs`, resuming from `run` if a checkpoint lies there, and yields the curves to a block that
+    publishes; until that has succeeded, `run` stays: after a kill there, nothing is left to train.
+
+    A checkpoint that cannot be read is set aside, and training starts anew.
 
     Args:
-        module: holds its final weights afterwards, or with `monitor` those of the epoch where it was best.
+        module: holds its final weights in the block, or with `monitor` those of the epoch where it was best.
         run: folder of the resumable checkpoints, removed at the end.
+        target: folder that the block will write; None writes none.
         monitor: logged name to select the kept weights by.
         validate: run the validation loop after each epoch.
         mode: whether the least or the largest value of `monitor` is best.
         gradient_clip: largest gradient norm, for automatic optimisation alone.
         callbacks: further ones.
+
+    Raises:
+        UserError: `target` or `run` cannot be written, before any training.
     """
+    if target is not None:
+        check_writable(target, folder=True)
+    check_writable(run / "last.ckpt", folder=False)
+    checkpoint = _checkpoint(run, ("last",) if monitor is None else ("last", "best"))
     curves, callbacks = Curves(), list(callbacks)
     if monitor is not None:
         callbacks.append(
@@ -110,6 +148,7 @@ def fit(
         accelerator="auto",
         devices=1,
         callbacks=callbacks,
+        plugins=[WholeCheckpoints()],
         logger=False,
         enable_progress_bar=progress,
         enable_model_summary=False,
@@ -117,15 +156,43 @@ def fit(
         limit_val_batches=None if validate else 0,
         gradient_clip_val=gradient_clip,
     )
-    checkpoint = run / "last.ckpt"
-    trainer.fit(module, datamodule=data, ckpt_path=str(checkpoint) if checkpoint.exists() else None, weights_only=True)
+    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
     if monitor is not None:
         kept = torch.load(run / "best.ckpt", map_location="cpu", weights_only=True)
         module.load_state_dict(kept["state_dict"])
+    yield curves
     shutil.rmtree(run, ignore_errors=True)
-    return curves
+
+
+def _checkpoint(run: Path, names: Sequence[str]) -> Path | None:
+    """The run's last checkpoint, where those of all these names can be read; else all are set aside."""
+    for orphan in run.glob(".*.partial"):  # of a process that was killed as it wrote
+        orphan.unlink()
+    paths = [run / f"{name}.ckpt" for name in names]
+    if not (run / "last.ckpt").exists():
+        return None
+    damaged = next((path for path in paths if not _readable(path)), None)
+    if damaged is None:
+        return run / "last.ckpt"
+    for path in paths:  # together, since one without the other would lead a later run astray
+        if path.exists():
+            path.replace(path.with_name(f"{path.name}.unreadable"))
+    sentence = f"{damaged} is damaged or missing, as after a power cut: it is set aside, and training starts anew."
+    Console(stderr=True).print(sentence, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    return None
+
+
+def _readable(checkpoint: Path) -> bool:
+    try:
+        return "state_dict" in torch.load(checkpoint, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        return False
+    except (OSError, MemoryError):  # says nothing about the file
+        raise
+    except Exception:  # whatever unpickling raises
+        return False
 
 
 def freeze(module: nn.Module, parts: Sequence[str]) -> None:

@@ -150,6 +150,63 @@ def test_init_leaves_an_existing_project_alone(tmp_path: Path, capsys: pytest.Ca
     assert (tmp_path / "dvc.yaml").read_text() == "mine"
 
 
+def everything(folder: Path) -> dict[str, bytes | None]:
+    """Every file's bytes below a folder, but git's; None of a folder."""
+    paths = [path for path in folder.rglob("*") if ".git" not in path.relative_to(folder).parts]
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in paths}
+
+
+def test_init_in_a_repository_of_ones_own_changes_nothing_that_is_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    subprocess.run(["git", "init", "-q"], check=True)
+    mine = ("notebooks/thesis.ipynb", "notebooks/figures/a.png", ".gitignore", ".dvcignore", ".dvc/config", "notes.md")
+    for name in mine:
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text(f"my {name}")
+    before = everything(tmp_path)
+    assert exit_status(["init", ".", "--preset", "tiny"]) == 0
+    assert "Left as they were: .dvcignore, .gitignore, .dvc/config\n" in capsys.readouterr().out
+    after = everything(tmp_path)
+    assert {name: after[name] for name in before} == before
+    new = {"dvc.yaml", "params.yaml", "notebooks/report.ipynb", ".dvc/.gitignore"}
+    assert after.keys() - before.keys() == new
+
+
+@pytest.mark.parametrize("name", ["params.yaml", "notebooks/report.ipynb", "notebooks", ".dvc", ".gitignore/deep"])
+def test_init_names_what_stands_in_its_way_and_writes_nothing(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    before = everything(tmp_path)
+    assert exit_status(["init", str(tmp_path)]) == 2
+    assert f"({name.removesuffix('/deep')})" in capsys.readouterr().err
+    assert everything(tmp_path) == before
+
+
+def test_an_init_that_was_interrupted_is_finished_by_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("envtf_lit.project.template._write_pipeline", interrupt)
+        assert exit_status(["init", str(tmp_path)]) == 130
+    assert exit_status(["init", str(tmp_path)]) == 0
+    assert (tmp_path / "dvc.yaml").is_file()
+
+
+def test_git_that_comes_after_init_needs_nothing_but_what_dvc_advises(tmp_path: Path) -> None:
+    assert exit_status(["init", str(tmp_path), "--preset", "tiny"]) == 0
+    status = [sys.executable, "-m", "dvc", "status", "--quiet"]
+    assert subprocess.run(status, cwd=tmp_path, capture_output=True, check=False).returncode in (0, 1)
+    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
+    subprocess.run([*status[:3], "config", "core.no_scm", "false"], cwd=tmp_path, check=True)
+    shown = subprocess.run([*status[:3], "exp", "list"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "Only supported for Git repositories" not in shown.stderr
+
+
 def test_doctor_reports_what_a_bug_report_needs(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(["doctor"]) == 0
     lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
@@ -167,10 +224,10 @@ def test_download_does_not_write_over_the_file_that_it_reads(
     tiny_download: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tiny_download)
-    before = {path: path.read_bytes() for path in (tiny_download / "data").iterdir()}
+    before = everything(tiny_download / "data")
     assert exit_status(["download", "--download.source=file", "--download.path=./data/dataset.h5"]) == 2
     assert "move your file to another place" in capsys.readouterr().err
-    assert {path: path.read_bytes() for path in before} == before
+    assert everything(tiny_download / "data") == before
 
 
 @pytest.mark.parametrize("kind", LIGHTNING)
@@ -187,7 +244,7 @@ def test_lightnings_command_lines_refuse_bad_input_alike(project: Path) -> None:
 
 FULL_DISK = """
 import resource, sys
-from envtf_lit.lightning_cli import run
+from envtf_lit.cli.lightning import run
 from envtf_lit.cli import main
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (4_000, 4_000))  # every larger file fails as on a full disk

@@ -104,7 +104,7 @@ def test_a_dataset_of_many_units_does_not_depend_on_their_order(monkeypatch: pyt
     monkeypatch.setattr("envtf_lit.zoo.collect.UNIT_ROWS", 100)
     task = get_task("hopper-medium-expert")
     forwards = collect(task, 240, seed=0, workers=1, progress=False)
-    monkeypatch.setattr("envtf_lit.data.behaviour.sorted", lambda jobs, key: list(jobs)[::-1], raising=False)
+    monkeypatch.setattr("envtf_lit.zoo.collect.sorted", lambda jobs, key: list(jobs)[::-1], raising=False)
     backwards = collect(task, 240, seed=0, workers=1, progress=False)
     assert all(np.array_equal(getattr(forwards, name), getattr(backwards, name)) for name in COLUMNS)
     alone = collect(get_task("hopper-medium"), 120, seed=0, workers=1, progress=False)

@@ -55,7 +55,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def envtf(kind: str, verb: str, *flags: str, **options: object) -> None:
-    """Runs a Lightning command line on the project's dataset."""
+    """Runs a Lightning command line on the project's dataset; a fit has `.envtf/published` to itself."""
+    if verb == "fit":
+        shutil.rmtree(".envtf/published", ignore_errors=True)  # an earlier one, beside which it would go
     named = [f"--model.options.{name.replace('__', '.')}={value}" for name, value in options.items()]
     main([kind, verb, "--data.path", "data/dataset.h5", *QUIET, *named, *flags])
 
@@ -142,7 +144,8 @@ def test_model_fit_trains_the_ensemble_where_its_options_stand(
     assert isinstance(model, EnsembleDynamics) and model.members == 3 and len(model.elite) == 2
     (checkpoint,) = Path(".envtf").rglob("*.ckpt")
     envtf("model", "validate", NO_LOGGER, f"--ckpt_path={checkpoint}")
-    fit("model", NO_LOGGER, f"--model.init_from={Path('.envtf/published').absolute()}", ensemble=json.dumps(sizes))
+    Path(".envtf/published").rename("first")
+    fit("model", f"--model.init_from={Path('first').absolute()}", ensemble=json.dumps(sizes))
 
 
 def test_model_fit_publishes_and_starts_from_published_weights(folder: Path) -> None:
@@ -279,7 +282,7 @@ def test_the_shipped_configuration_stops_early_and_publishes_the_best_epoch(
     main([*started, *budget, "--model.options.learning_rate=1", "--trainer.max_epochs=4"])  # nor here, after that
     (best,) = set(Path(".envtf").rglob("*.ckpt")) - {checkpoint}
     kept = torch.load(best, weights_only=True)["state_dict"]
-    published = load_world_model(".envtf/published").state_dict()
+    published = load_world_model(".envtf/published_1").state_dict()
     assert all(torch.equal(kept[f"model.{name}"], published[name]) for name in published if name.startswith("blocks"))
 
 
@@ -389,12 +392,30 @@ def test_checkpoints_that_do_not_fit_are_refused(folder: Path, capsys: pytest.Ca
 
 def test_a_saved_config_is_a_config(folder: Path) -> None:
     fit("agent")
-    published = Path(".envtf/published/weights.safetensors")
-    first = published.read_bytes()
-    published.unlink()
-    Path(".envtf/config.yaml").rename("again.yaml")
-    main(["agent", "fit", "--config", "again.yaml"])
-    assert published.read_bytes() == first
+    main(["agent", "fit", "--config", ".envtf/config.yaml"])
+    first, second = (Path(f".envtf/published{name}/weights.safetensors").read_bytes() for name in ("", "_1"))
+    assert first == second
+
+
+def test_runs_do_not_overwrite_one_another_nor_a_file_of_the_users(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path(".envtf/published").mkdir(parents=True)
+    for mine in (".envtf/published/notes.txt", ".envtf/config.yaml"):
+        Path(mine).write_text("mine")
+    options = [f"--model.options.{name}={value}" for name, value in {**SIZES["agent"], **RUN}.items()]
+    command = ["agent", "fit", "--data.path", "data/dataset.h5", *QUIET, *options]
+    for number in (1, 2):
+        main([*command, NO_LOGGER])
+        assert f": .envtf/published_{number}\n" in capsys.readouterr().out
+        assert Path(f".envtf/config_{number}.yaml").is_file()
+        load_policy(f".envtf/published_{number}")
+    main([*command, "--trainer.fast_dev_run=true"])
+    names = {"published", "published_1", "published_2", "config.yaml", "config_1.yaml", "config_2.yaml", "checkpoints"}
+    assert {path.name for path in Path(".envtf").iterdir()} == names
+    assert [path.read_text() for path in (Path(".envtf/published/notes.txt"), Path(".envtf/config.yaml"))] == [
+        "mine"
+    ] * 2
 
 
 # loggers

@@ -21,7 +21,7 @@ from envtf_lit.pipeline.stage import WORLD_MODEL
 from envtf_lit.pipeline.train_model import train_model
 from envtf_lit.pipeline.train_policy import train_policy
 from envtf_lit.pipeline.yaml import params_yaml, preset_params
-from envtf_lit.training import fit, run_folder
+from envtf_lit.training import run_folder, trained
 from envtf_lit.world_models.forecast import Scale, open_loop_error, segments
 from envtf_lit.world_models.lit import SELECTION_HORIZON, SELECTION_SEGMENTS, lit_world_model, window_data
 from envtf_lit.world_models.options import ModelOptions, TrainModelOptions
@@ -39,6 +39,14 @@ TINY = Params(
         held_out=0.2,
     ),
 )
+IMAGINATION = ImaginationOptions(
+    refresh_every=2,
+    branches=20,
+    horizon=2,
+    history=2,
+    buffer_size=100,
+    value_gradient=ValueGradientOptions(updates=6, rollouts=5, horizon=3),
+)
 POLICY = PolicyOptions(
     updates=12,
     updates_per_epoch=4,
@@ -46,14 +54,7 @@ POLICY = PolicyOptions(
     batch_size=16,
     hidden=(16, 16),
     warm_start=4,
-    imagination=ImaginationOptions(
-        refresh_every=2,
-        branches=20,
-        horizon=2,
-        history=2,
-        buffer_size=100,
-        value_gradient=ValueGradientOptions(updates=6, rollouts=5, horizon=3),
-    ),
+    imagination=IMAGINATION,
 )
 TINY = replace(
     TINY,
@@ -77,6 +78,13 @@ class Killer(Callback):
             raise Killed
 
 
+class Idle(Callback):
+    """Refuses to see any training."""
+
+    def on_train_batch_start(self, *_: object) -> None:
+        raise AssertionError("there was nothing left to train")
+
+
 class Norms(Callback):
     """Notes how large the gradients are that a step was made with."""
 
@@ -94,12 +102,20 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def kill_in_epoch(monkeypatch: pytest.MonkeyPatch, epoch: int) -> None:
+def train_with(monkeypatch: pytest.MonkeyPatch, callback: Callback) -> None:
     trainer = L.Trainer
     monkeypatch.setattr(
         "envtf_lit.training.L.Trainer",
-        lambda **kwargs: trainer(**{**kwargs, "callbacks": [*kwargs["callbacks"], Killer(epoch)]}),
+        lambda **kwargs: trainer(**{**kwargs, "callbacks": [*kwargs["callbacks"], callback]}),
     )
+
+
+def kill_in_epoch(monkeypatch: pytest.MonkeyPatch, epoch: int) -> None:
+    train_with(monkeypatch, Killer(epoch))
+
+
+def killed(*_: object, **__: object) -> None:
+    raise Killed
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
@@ -178,16 +194,18 @@ def test_gradients_are_clipped_before_a_step_in_one_pass(root, precision):
     data = window_data(str(root / "data/dataset.h5"), options, seed=0)
     lit = lit_world_model(data.observation_dim, data.action_dim, options)
     norms = Norms()
-    fit(
+    with trained(
         lit,
         data,
         run=root / "run",
+        target=None,
         epochs=1,
         precision=precision,
         progress=False,
         gradient_clip=1e-3,
         callbacks=[norms],
-    )
+    ):
+        pass
     assert norms.seen == pytest.approx([1e-3] * options.updates_per_epoch, rel=1e-2)
     assert lit.configure_optimizers()["optimizer"].defaults["fused"]
 

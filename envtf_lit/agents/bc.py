@@ -1,6 +1,8 @@
 """Behaviour cloning: the policy of the log, by maximum likelihood. The baseline, and who imagines first."""
 
+import contextlib
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from envtf_lit.data.loaders import TransitionData
 from envtf_lit.imagination.options import GenerateRolloutsOptions
 from envtf_lit.options.schema import Precision
 from envtf_lit.policy import TanhGaussianActor
-from envtf_lit.training import Curves, fit
+from envtf_lit.training import Curves, trained
 
 CLONE_STEPS_PER_EPOCH = 10  # Lightning steps of 10 updates each
 
@@ -40,17 +42,22 @@ class BehaviourClone(L.LightningModule):
         return torch.optim.Adam(self.actor.parameters(), lr=self.learning_rate)
 
 
-def clone_behaviour(
+@contextlib.contextmanager
+def cloned_behaviour(
     path: Path,
     options: GenerateRolloutsOptions,
     *,
     seed: int,
     run: Path,
+    target: Path,
     precision: Precision,
     progress: bool,
     held_out: float = 0.0,
-) -> tuple[TanhGaussianActor, Curves]:
-    """Fits a clone to the dataset at `path`, less a share held out; `run` holds resumable checkpoints meanwhile."""
+) -> Iterator[tuple[TanhGaussianActor, Curves]]:
+    """Fits a clone to the dataset at `path`, less a share held out, for a block that publishes it as `target`.
+
+    `run` holds resumable checkpoints until the block has succeeded, as of `trained`.
+    """
     data = TransitionData(
         str(path),
         batch_size=options.clone_batch_size,
@@ -70,7 +77,11 @@ def clone_behaviour(
     updates_per_epoch = CLONE_STEPS_PER_EPOCH * data.updates_per_step
     epochs = max(1, round(options.clone_updates / updates_per_epoch))
     clone = BehaviourClone(actor)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*have no `validation_step`")  # the data offer more than a clone needs
-        curves = fit(clone, data, run=run, epochs=epochs, precision=precision, progress=progress, validate=False)
-    return actor.eval(), curves
+    training = trained(
+        clone, data, run=run, target=target, epochs=epochs, precision=precision, progress=progress, validate=False
+    )
+    with contextlib.ExitStack() as stack:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*have no `validation_step`")  # the data offer more than a clone needs
+            curves = stack.enter_context(training)
+        yield actor.eval(), curves

@@ -1,10 +1,11 @@
 """`envtf model …` and `envtf agent …`: LightningCLI over the classes that the pipeline trains."""
 
+import itertools
 import json
+import os
 import re
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,25 +14,27 @@ import torch
 from jsonargparse import Namespace
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from rich.console import Console
 
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.options import PolicyOptions, check_no_imagination, check_policy
 from envtf_lit.agents.store import publish_policy
+from envtf_lit.cli.saved_options import checkpoint_options, model_architecture, policy_architecture
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import TransitionData, WindowData
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.data.sources.minari import read_minari
 from envtf_lit.errors import UserError
-from envtf_lit.files import read_json, replacing
+from envtf_lit.files import replacing
 from envtf_lit.options.schema import build_section
 from envtf_lit.pipeline.params import Params
-from envtf_lit.training import Curves
+from envtf_lit.training import Curves, WholeCheckpoints
 from envtf_lit.world_models.fit import publish_world_model
 from envtf_lit.world_models.lit import LitEnsemble, LitWorldModel, lit_world_model, window_options
 from envtf_lit.world_models.options import TrainModelOptions, check_world_model
 
-CONFIGS = Path(__file__).parent / "configs"
+CONFIGS = Path(__file__).parent.parent / "configs"
 SHIPPED = ", ".join(sorted(path.stem for path in CONFIGS.glob("*.yaml")))
 
 TRUST = (
@@ -41,7 +44,8 @@ TRUST = (
     "--model.options.updates N, or --trainer.max_epochs N to leave the learning-rate schedule as it is. A model that "
     "starts from another (--model.init_from) has its architecture where no flag says otherwise. After fit, the weights "
     "of the last update, or of the best epoch where a ModelCheckpoint with a monitor says which that is, lie in the "
-    "folder `published`, whose path is printed. --config takes a file, or the name of one that comes along: "
+    "folder `published`, or `published_1`, …, beside an earlier run's; its path is printed. --config takes a file, or "
+    "the name of one that comes along: "
     f"{SHIPPED}."
 )
 
@@ -139,13 +143,17 @@ class LogTransitions(_Sourced, TransitionData):
 
 
 class Publish(Callback):
-    """Writes what was trained as a model folder, as the pipeline's stages do, beside the run's logs."""
+    """Writes what was trained as a model folder, as the pipeline's stages do, beside the run's logs.
+
+    What an earlier run published there stays, and a trial run, `fast_dev_run`, leaves nothing behind.
+    """
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         # by all processes: each may hold a part of the weights
-        state, folder = trainer.strategy.lightning_module_state_dict(), _folder(trainer) / "published"
-        if not trainer.is_global_zero:
+        state, place = trainer.strategy.lightning_module_state_dict(), _folder(trainer) / "published"
+        if trainer.fast_dev_run or not trainer.is_global_zero:  # pyright: ignore[reportAttributeAccessIssue]
             return
+        folder = _free(place)
         curves = _curves(trainer)
         weights, row = "last update", curves.rows[-1] if curves.rows else {}
         if isinstance(pl_module, LitEnsemble):
@@ -178,14 +186,14 @@ def _best(trainer: L.Trainer) -> ModelCheckpoint | None:
 
 
 class KeepConfig(SaveConfigCallback):
-    """Writes the whole configuration to `config.yaml` beside the run's logs, wherever the logger keeps them."""
+    """Writes the whole configuration to `config.yaml`, or `config_1.yaml`, …, beside the run's logs."""
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         self.folder = _folder(trainer)
         super().setup(trainer, pl_module, stage)
 
     def save_config(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        with replacing(self.folder / "config.yaml") as temporary:
+        with replacing(_free(self.folder / "config.yaml")) as temporary:
             self.parser.save(self.config, str(temporary), skip_none=False, multifile=False)
 
 
@@ -194,12 +202,19 @@ def _folder(trainer: L.Trainer) -> Path:
     return Path(trainer.log_dir or trainer.default_root_dir)
 
 
+def _free(path: Path) -> Path:
+    """The path, or the first of `NAME_1`, `NAME_2`, … that is not there: without a logger, runs share a folder."""
+    numbered = (path.with_stem(f"{path.stem}_{number}") for number in itertools.count(1))
+    return next(free for free in itertools.chain([path], numbered) if not os.path.lexists(free))
+
+
 class _LinkedCLI(LightningCLI):
     """Takes dimensions from the dataset, asks only once for what model and data share, and stops when updates say."""
 
     from_data: tuple[str, ...] = ("observation_dim", "action_dim")
     links: dict[str, str]
     options: type[TrainModelOptions] | type[PolicyOptions]
+    architecture: Callable[[str], dict[str, Any]]  # the options that a published folder's weights ask for
     verbs: tuple[str, ...]
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -226,9 +241,9 @@ class _LinkedCLI(LightningCLI):
             verb = self.config.subcommand
             checkpoint, base = self.config[verb].ckpt_path, self.config[verb].model.init_from
             if checkpoint is not None and not LIGHTNINGS_OWN.match(checkpoint):
-                below = _saved_options(checkpoint, self.options)
+                below = checkpoint_options(checkpoint, self.options)
             elif base is not None:
-                below = {"options": self.architecture(read_json(Path(base) / "config.json"))}
+                below = {"options": self.architecture(base)}
             else:
                 return
             begin = args.index(verb) + 1  # below flags: the first --config
@@ -239,12 +254,9 @@ class _LinkedCLI(LightningCLI):
         # only now: Lightning would take it for the callback that saves checkpoints, and make none;
         # at the front, so that checkpoints hold the row of their epoch
         trainer.callbacks.insert(0, Curves())  # pyright: ignore[reportAttributeAccessIssue]
+        if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:  # neither a strategy's own nor the user's
+            trainer.strategy.checkpoint_io = WholeCheckpoints()
         return trainer
-
-    @staticmethod
-    def architecture(config: dict[str, Any]) -> dict[str, Any]:
-        """The options that a published folder's weights ask for, given its config.json."""
-        raise NotImplementedError
 
     @staticmethod
     def check(options: Any) -> None:
@@ -274,13 +286,9 @@ class ModelCLI(_LinkedCLI):
     """`envtf model`."""
 
     options = TrainModelOptions
+    architecture = staticmethod(model_architecture)
     verbs = ("fit", "validate", "test")
     links = {"model.options.held_out": "data.held_out", "model.seed": "data.seed"}
-
-    @staticmethod
-    def architecture(config: dict[str, Any]) -> dict[str, Any]:
-        arguments = _arguments(config, ("observation_dim", "action_dim"))
-        return {"ensemble": arguments} if config.get("kind") == "ensemble_dynamics" else {"model": arguments}
 
     @staticmethod
     def check(options: TrainModelOptions) -> None:
@@ -295,6 +303,7 @@ class AgentCLI(_LinkedCLI):
     """`envtf agent`."""
 
     options = PolicyOptions
+    architecture = staticmethod(policy_architecture)
     verbs = ("fit", "validate")
     from_data = ("observation_dim", "action_dim", "action_low", "action_high")
     links = {
@@ -305,10 +314,6 @@ class AgentCLI(_LinkedCLI):
         "model.options.return_temperature": "data.return_temperature",
         "model.seed": "data.seed",
     }
-
-    @staticmethod
-    def architecture(config: dict[str, Any]) -> dict[str, Any]:
-        return {name: value for name, value in _arguments(config).items() if name == "hidden"}
 
     @staticmethod
     def check(options: PolicyOptions) -> None:
@@ -334,31 +339,6 @@ def _plain(options: Namespace) -> dict[str, Any]:
     """The options as nested dictionaries, whatever jsonargparse wraps around optional dataclasses."""
     values = {name: _plain(value) if isinstance(value, Namespace) else value for name, value in vars(options).items()}
     return values.get("init_args", values)
-
-
-def _saved_options(checkpoint: str, kind: type[TrainModelOptions] | type[PolicyOptions]) -> dict[str, Any]:
-    """The options, of this kind, and the seed that a Lightning checkpoint was trained with.
-
-    Raises:
-        UserError: the file is missing or is not such a checkpoint.
-    """
-    try:
-        saved = torch.load(checkpoint, map_location="cpu", weights_only=True)["hyper_parameters"]
-        if not saved["options"].keys() <= {field.name for field in fields(kind)}:
-            raise KeyError
-        return {name: saved[name] for name in ("options", "seed", "freeze")}
-    except FileNotFoundError:
-        raise UserError(f"{checkpoint} does not exist: give --ckpt_path a checkpoint of an earlier fit.") from None
-    except Exception:  # whatever unpickling raises; torch's own message recommends to run code found in the file
-        raise UserError(
-            f"{checkpoint} is not a checkpoint of this model: give --ckpt_path a file that fit wrote."
-        ) from None
-
-
-def _arguments(config: dict[str, Any], without: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The constructor's arguments in a published folder's config.json; an odd file is for the loader to refuse."""
-    arguments = config.get("arguments") if isinstance(config, dict) else None
-    return {name: value for name, value in (arguments or {}).items() if name not in without}
 
 
 def _shipped_configs(arguments: list[str]) -> Iterator[str]:

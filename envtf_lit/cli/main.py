@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -86,7 +87,7 @@ def build_parser() -> argparse.ArgumentParser:
     for name, summary in LIGHTNING.items():
         commands.add_parser(name, help=summary, add_help=False)
     init = _add(commands, "init", "Write a new project: dvc.yaml, params.yaml, notebooks", _init)
-    init.add_argument("folder", type=Path, help="created if missing; must not hold a dvc.yaml")
+    init.add_argument("folder", type=Path, help="created if missing; what it holds stays as it is")
     params = _add(commands, "params", "Print a complete params.yaml", _params)
     for command in (init, params):
         command.add_argument("--preset", default="small", help="tiny, small, base or paper; default: small")
@@ -349,8 +350,12 @@ def _init(namespace: argparse.Namespace, rest: list[str]) -> None:
 
     from envtf_lit.project.template import write_project
 
-    write_project(namespace.folder, namespace.preset)
-    Console().print(f"Wrote a project to {namespace.folder}. Next: cd {namespace.folder} && dvc repro", soft_wrap=True)
+    kept, console = write_project(namespace.folder, namespace.preset), Console(highlight=False, soft_wrap=True)
+    if kept:
+        console.print(f"Left as they were: {', '.join(kept)}", markup=False)
+    first = "" if find_spec("dvc") else "pip install 'envtf-lit[pipeline]' && "
+    following = f"Next: {first}cd {namespace.folder} && dvc repro"
+    console.print(f"Wrote a project to {namespace.folder}. {following}", markup=False)
 
 
 def _params(namespace: argparse.Namespace, rest: list[str]) -> None:

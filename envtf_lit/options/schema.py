@@ -118,13 +118,20 @@ def _plain(hint: type, value: Any, key: str) -> Any:
 def _number(hint: type, value: Any, key: str, name: str) -> Any:
     kind = "an integer" if hint is int else "a number"
     limits = RANGES.get(name, _FINITE)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
         _refuse(key, value, f"{kind}, {limits.words}")
     if hint is int and value != int(value):  # 1e6 is a float to YAML and a fine count to everybody
         _refuse(key, value, f"{kind}, {limits.words}")
     if not limits.passes(value):
         _refuse(key, value, f"{kind}, {limits.words}")
     return hint(value)
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond all floats
+        return False
 
 
 class Budget(Protocol):

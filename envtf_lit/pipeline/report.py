@@ -3,13 +3,21 @@
 from pathlib import Path
 from typing import Any
 
-from envtf_lit.figures.notebook import execute
+from envtf_lit.errors import missing_extra
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.stage import REPORTS, run_stage
 
 
 def report(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
-    """Executes `notebooks/report.ipynb` on the other stages' outputs: `reports/report.ipynb` and `.html`."""
+    """Executes `notebooks/report.ipynb` on the other stages' outputs: `reports/report.ipynb` and `.html`.
+
+    Raises:
+        UserError: the extra `pipeline` is missing, or a cell failed.
+    """
+    try:
+        from envtf_lit.figures.notebook import execute
+    except ModuleNotFoundError as error:
+        raise missing_extra("The report needs papermill and nbconvert", "pipeline", error) from None
     with run_stage("report", params, root):
         page = execute(
             root / "notebooks/report.ipynb",

@@ -21,7 +21,7 @@ from envtf_lit.pipeline.stage import (
     run_stage,
     unseen,
 )
-from envtf_lit.training import fit, run_folder
+from envtf_lit.training import run_folder, trained
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination import termination_rule
 
@@ -30,6 +30,7 @@ def train_policy(
     params: Params, root: Path = Path("."), *, algorithm: str = "et_cql", progress: bool = True
 ) -> dict[str, Any]:
     """Trains `cql` (data alone) or `et_cql` (data and imagination): `models/policy/<algorithm>/`."""
+
     options: PolicyOptions = getattr(params.train_policy, algorithm)
     with run_stage(f"train_policy_{algorithm}", params, root):
         data = TransitionData(
@@ -57,19 +58,21 @@ def train_policy(
             inputs += [root / WORLD_MODEL, root / ROLLOUTS]
             monitor = "val/imagined_return" if options.imagination.selection_episodes > 0 else None
         key = run_settings(params, asdict(options)) | unseen(params)
-        curves = fit(
+        target = root / POLICIES / algorithm
+        with trained(
             agent,
             data,
             run=run_folder(root, f"train_policy_{algorithm}", key, inputs),
+            target=target,
             epochs=options.updates // options.updates_per_epoch,
             precision=params.precision,
             progress=progress,
             monitor=monitor,
             mode="max",
             validate=False,
-        )
-        kept = max(curves.rows, key=lambda row: row[monitor]) if monitor else curves.rows[-1]
-        return publish_policy(root / POLICIES / algorithm, agent.average_actor, curves, kept, key)
+        ) as curves:
+            kept = max(curves.rows, key=lambda row: row[monitor]) if monitor else curves.rows[-1]
+            return publish_policy(target, agent.average_actor, curves, kept, key)
 
 
 def _give_imagination(agent: Any, params: Params, root: Path, dataset: Any) -> None:

@@ -4,7 +4,8 @@ import os
 import platform
 import shutil
 import sys
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, distribution, version
+from pathlib import Path
 
 PACKAGES = (
     "envtf-lit",
@@ -18,6 +19,7 @@ PACKAGES = (
     "papermill",
     "jsonargparse",
 )
+MUJOCO = ("mujoco", "mujoco-core", "mujoco-studio")  # one package up to version 3
 
 
 def report() -> dict[str, str]:
@@ -26,6 +28,7 @@ def report() -> dict[str, str]:
         "platform": f"{platform.platform()}, {platform.machine()}",
         "python": f"{platform.python_version()} in {sys.prefix}",
         **{package: _version(package) for package in PACKAGES},
+        **_torn_mujoco(),
         **_torch(),
         "memory": f"{_memory_gib():.1f} GiB",
         "disk here": "{2:.1f} of {0:.1f} GiB free".format(*(x / 2**30 for x in shutil.disk_usage("."))),
@@ -39,6 +42,22 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "missing"
+
+
+def _torn_mujoco() -> dict[str, str]:
+    """The cure, if pip upgraded MuJoCo in place from 3: with the old package it removes files just laid by the new."""
+    try:
+        core = distribution("mujoco-core")
+    except PackageNotFoundError:
+        return {}
+    lost = [file for file in core.files or () if file.suffix != ".pyc" and not Path(file.locate()).exists()]
+    if not lost:
+        return {}
+    pins = " ".join(f"{package}=={core.version}" for package in MUJOCO)
+    return {
+        "mujoco": f"{core.version}, broken: {len(lost)} files of mujoco-core are missing, as after an upgrade from "
+        f"MuJoCo 3; install it anew: pip install --force-reinstall --no-deps {pins}"
+    }
 
 
 def _torch() -> dict[str, str]:

@@ -1,13 +1,14 @@
 """The project that `envtf init` writes: the repository's own pipeline, without the repository's code."""
 
-import shutil
+import os
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 
 from ruamel.yaml import YAML
 
 from envtf_lit.errors import UserError
-from envtf_lit.files import replacing
+from envtf_lit.files import replacing, write_text
 from envtf_lit.pipeline.yaml import params_yaml, preset_params
 
 PLAIN_FILES = (".dvcignore", ".gitignore")
@@ -16,34 +17,60 @@ DVC_CONFIG = "[core]\n    analytics = false\n    check_update = false\n"
 
 def template_folder() -> Path:
     """Where the template's files lie: inside the installed package, or at the root of a checkout."""
-    package = Path(__file__).parent
+    package = Path(__file__).parent.parent
     shipped = package / "template"
     return shipped if shipped.is_dir() else package.parent
 
 
-def write_project(folder: Path, preset: str) -> None:
+def write_project(folder: Path, preset: str) -> list[str]:
     """Writes dvc.yaml, params.yaml of that preset, notebooks, and DVC's settings into `folder`.
 
+    Nothing that lies there is changed. Settings of git and DVC that are there already stay in force.
+
+    Returns:
+        The names of those settings.
+
     Raises:
-        UserError: no such preset, or a project is there already.
+        UserError: no such preset, a project is there already, or other files have the names of the project's.
     """
     params = params_yaml(preset_params(preset))
-    if (folder / "dvc.yaml").exists():
+    if os.path.lexists(folder / "dvc.yaml"):
         raise UserError(
             f"{folder}/dvc.yaml exists already: choose another folder, or `envtf params` for a params.yaml."
         )
     source = template_folder()
-    with replacing(folder / "notebooks") as notebooks:
-        shutil.copytree(source / "notebooks", notebooks, ignore=shutil.ignore_patterns(".*"))
-    for name in PLAIN_FILES:
-        shutil.copyfile(source / name, folder / name)
-    (folder / ".dvc").mkdir(exist_ok=True)
-    (folder / ".dvc" / "config").write_text(DVC_CONFIG)
-    (folder / ".dvc" / ".gitignore").write_text("/config.local\n/tmp\n/cache\n")
-    if not _in_git(folder):
-        (folder / ".dvc" / "config.local").write_text("[core]\n    no_scm = true\n")
-    (folder / "params.yaml").write_text(params)
+    files = {f"notebooks/{path.name}": path.read_text("utf-8") for path in (source / "notebooks").glob("[!.]*")}
+    files["params.yaml"] = params
+    settings = {name: (source / name).read_text("utf-8") for name in PLAIN_FILES} | _dvc_settings(folder)
+    kept = [name for name in settings if (folder / name).is_file()]
+    missing = {name: text for name, text in (settings | files).items() if name not in kept}
+    _refuse_others(folder, missing)
+    for name, text in missing.items():
+        write_text(folder / name, text)
     _write_pipeline(source / "dvc.yaml", folder / "dvc.yaml")
+    return [name for name in kept if (folder / name).read_bytes() != settings[name].encode()]
+
+
+def _dvc_settings(folder: Path) -> dict[str, str]:
+    """For a folder outside git they say so where DVC's own advice, once there is git, takes it back."""
+    config = DVC_CONFIG if _in_git(folder) else f"{DVC_CONFIG}    no_scm = true\n"
+    return {".dvc/config": config, ".dvc/.gitignore": "/config.local\n/tmp\n/cache\n"}
+
+
+def _refuse_others(folder: Path, files: Mapping[str, str]) -> None:
+    """Raises UserError if anything but these very files stands in their place, or a file in that of their folders."""
+    places = dict[str, str | None](files) | {os.path.dirname(name): None for name in files if "/" in name}
+    others = [name for name, text in places.items() if os.path.lexists(folder / name) and not _is(folder / name, text)]
+    if others:
+        raise UserError(
+            f"{folder} has files of the names that the project's have ({', '.join(sorted(others))}): move or rename "
+            "them, or choose another folder. Nothing was written."
+        )
+
+
+def _is(path: Path, text: str | None) -> bool:
+    """Whether it is a file of that text; without one, a folder."""
+    return path.is_dir() if text is None else path.is_file() and path.read_bytes() == text.encode()
 
 
 def _write_pipeline(source: Path, target: Path) -> None:
@@ -71,8 +98,9 @@ def _is_code(path: str) -> bool:
 
 
 def _in_git(folder: Path) -> bool:
+    nearest = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.is_dir())
     try:
-        inside = subprocess.run(["git", "rev-parse"], cwd=folder, capture_output=True, check=False)
+        inside = subprocess.run(["git", "rev-parse"], cwd=nearest, capture_output=True, check=False)
     except FileNotFoundError:
         return False
     return inside.returncode == 0

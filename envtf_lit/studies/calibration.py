@@ -28,6 +28,7 @@ from envtf_lit.evaluation.calibration import (
 from envtf_lit.evaluation.physics import Physics
 from envtf_lit.figures.calibration import calibration_page
 from envtf_lit.files import pick_device, write_json, write_text
+from envtf_lit.results import claim
 from envtf_lit.robots.returns import SEED_OFFSET
 from envtf_lit.robots.tasks import Task, get_task
 from envtf_lit.studies.suite import (
@@ -120,10 +121,12 @@ def compare(
         What `out` holds.
 
     Raises:
-        UserError: an unknown robot or tier, a folder without a world model of the robot, or a name that is taken.
+        UserError: an unknown robot or tier, a folder without a world model of the robot, a name that is taken, or
+            a file in the way that is none of this command's.
     """
     tasks = [get_task(f"{robot}-{tier}") for robot in dict.fromkeys(robots)]
     further = other_folders(others or {}, tasks)
+    claim(out, "calibration.points", [out.with_suffix(ending) for ending in (".md", ".png", ".csv")])
     torch.set_num_threads(options.threads)
     found: dict[str, Results] = {}
     numbers = heading(tier, options, calibration=measured)

@@ -18,10 +18,11 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from envtf_lit.files import pick_device, write_json
+from envtf_lit.results import claim
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.studies.machine import facts
 from envtf_lit.studies.suite import WORK, SuiteOptions, build_suite, model_params
-from envtf_lit.training import fit, run_folder
+from envtf_lit.training import run_folder, trained
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.forecast import Scale, forecast, nmse, segments
 from envtf_lit.world_models.lit import lit_world_model, window_data
@@ -57,8 +58,10 @@ def bench_cost(
         `MODEL_peak_memory_mb` of its process, and on an accelerator `MODEL_peak_device_memory_mb`; and the machine.
 
     Raises:
-        UserError: an unknown task, or options that contradict each other.
+        UserError: an unknown task, options that contradict each other, or `out` is there and no such result.
     """
+    if out is not None:
+        claim(out, "target_error")
     for name in ("transformer", "ensemble"):
         model_params(name, task, options)  # what is wrong with the options shows before any work
     dataset = build_suite(task, work, options, models=(), progress=progress).dataset
@@ -93,16 +96,18 @@ def _trial(name: str, task: str, dataset: Path, root: Path, options: SuiteOption
     data, clock, budget = window_data(str(dataset), train, seed=options.seed), Clock(), train.ensemble or train
     lit = lit_world_model(robot.observation_dim, robot.action_dim, train, options.seed, compile=options.compile)
     key = {"trial": time.time_ns(), "options": asdict(train)}  # never continued: its seconds would not be known
-    fit(
+    with trained(
         lit,
         data,
         run=run_folder(root, "bench_cost", key, []),
+        target=None,
         epochs=budget.updates // budget.updates_per_epoch,
         precision=options.precision,
         progress=progress,
         gradient_clip=lit.gradient_clip,
         callbacks=[clock],
-    )
+    ):
+        pass  # nothing is kept
     trial = {
         "curve": clock.curve,
         "seconds_in_all": clock.curve[-1][0],

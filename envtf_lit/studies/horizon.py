@@ -18,6 +18,7 @@ from envtf_lit.evaluation.physics import Physics, ceiling
 from envtf_lit.evaluation.tracking import Tracking, fresh_episodes, track, track_ceiling, track_sampled
 from envtf_lit.figures import horizons
 from envtf_lit.files import pick_device, write_json, write_text
+from envtf_lit.results import claim
 from envtf_lit.robots.returns import SEED_OFFSET
 from envtf_lit.robots.tasks import Task, get_task
 from envtf_lit.studies.suite import (
@@ -92,13 +93,14 @@ def compare(
         What the file holds, under flat keys: `flat_numbers` and what they depend on.
 
     Raises:
-        UserError: an unknown robot or tier, too few episodes, a folder without a world model of the robot, or a name
-            that is taken.
+        UserError: an unknown robot or tier, too few episodes, a folder without a world model of the robot, a name that
+            is taken, or a file in the way that is none of this command's.
     """
     tasks = [get_task(f"{robot}-{tier}") for robot in dict.fromkeys(robots)]
     further = other_folders(others or {}, tasks)
     if min(measured.trajectories, measured.online) < 1:
         raise UserError("A length is a mean over at least one trajectory: ask for more than none.")
+    claim(out, "measured.trajectories", [out.with_suffix(".md"), *_figures(out.with_suffix(""))])
     torch.set_num_threads(options.threads)
     clock = _Clock([SUITE, EPISODES, PHYSICS, *models, *(others or {})], len(tasks), report)
     found: dict[str, Results] = {}
@@ -292,6 +294,12 @@ def _offline_row(robot: str, model: str, numbers: Mapping[str, float]) -> tuple[
 def _online_cells(numbers: Mapping[str, float]) -> tuple[str, ...]:
     shares = f"{numbers['open_loop_0.1_censored']:.0%}", f"{numbers['explosion_rate']:.1%}"
     return (*(_steps(numbers, f"open_loop_{threshold:g}") for threshold in THRESHOLDS), *shares)
+
+
+def _figures(folder: Path) -> list[Path]:
+    """What `draw` writes."""
+    names = ("open_loop", "teacher_forced", "online", "ceiling")
+    return [folder / f"{name}{ending}" for name in names for ending in (".png", ".csv")]
 
 
 def draw(found: Mapping[str, Results], folder: Path) -> None:

@@ -12,6 +12,7 @@ from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.evaluation.in_context import Recognition, recognition, recognition_metrics, stretches
 from envtf_lit.figures.in_context import recognition_curves
 from envtf_lit.files import pick_device, write_json
+from envtf_lit.results import claim
 from envtf_lit.robots.tasks import Task, get_task
 from envtf_lit.studies.suite import WORK, Suite, SuiteOptions, build_suite, flat_settings, heading, kept, measurable
 from envtf_lit.world_models.forecast import Scale
@@ -61,11 +62,13 @@ def compare(
         What the file holds: options, and `robot.model.metric` as `recognition_metrics` explains.
 
     Raises:
-        UserError: an unknown robot or tier, an option out of range, or a folder that cannot be written.
+        UserError: an unknown robot or tier, an option out of range, a folder that cannot be written, or a file in the
+            way that is none of this command's.
     """
     tasks = [get_task(f"{robot}-{tier}-hidden") for robot in dict.fromkeys(robots)]
     for task in tasks:
         plan(task, measured.unseen)  # complains before anything is trained
+    claim(out, "measured.unseen", [out.with_suffix(".png"), out.with_suffix(".csv")])
     torch.set_num_threads(options.threads)
     metrics = heading(tier, options, measured=measured)
     found = dict[str, dict[str, Recognition]]()

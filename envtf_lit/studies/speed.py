@@ -23,6 +23,7 @@ from envtf_lit.imagination.rollouts import imagine
 from envtf_lit.options.schema import Precision
 from envtf_lit.pipeline.yaml import preset_params
 from envtf_lit.policy import TanhGaussianActor
+from envtf_lit.results import claim
 from envtf_lit.robots.tasks import ROBOTS, Robot, never_terminated
 from envtf_lit.studies.machine import bench_device, facts, in_turns, ratio, seconds, typical
 from envtf_lit.training import autocast
@@ -79,8 +80,10 @@ def bench_model(
         Flat; `docs/bench.md` explains each.
 
     Raises:
-        UserError: an unknown preset or device.
+        UserError: an unknown preset or device, or `out` is there and no such result.
     """
+    if out is not None:
+        claim(out, "train_fraction_of_matmul_peak")
     place, options, body = bench_device(device), preset_params(preset).train_model, ROBOTS[robot]
     options = replace(options, batch_size=windows or options.batch_size)
     warm_up = 3 if compile else 1  # what is compiled is compiled again for other shapes, and recorded at its second run

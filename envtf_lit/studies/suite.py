@@ -26,6 +26,7 @@ from envtf_lit.options.schema import Precision
 from envtf_lit.pipeline.download import download
 from envtf_lit.pipeline.params import Params, check_ranges
 from envtf_lit.pipeline.stage import CARD, DATASET, run_settings
+from envtf_lit.results import has, read_or_none, refuse_others
 from envtf_lit.robots.tasks import Robot, Task, get_task
 from envtf_lit.studies.machine import hardware
 from envtf_lit.training import run_folder
@@ -202,8 +203,9 @@ def build_suite(
     shared, card = replace(Params(), task=task, **_common(options)), home / CARD
     # a record that is older than this key is judged by the dataset's card
     older = {"origin": {name: read_json(card).get(name) for name in key["origin"]}} if card.exists() else {}
-    _unless_done(home / "data.json", key, lambda: download(shared, home, progress=progress), older)
     suite = Suite(task, get_task(task).robot, options, home / DATASET, {}, {}, {})
+    collect = partial(download, shared, home, progress=progress)
+    _unless_done(home / "data.json", suite.dataset, key, collect, older)
     for name in models:
         add_model(suite, name, params[name].train_model, progress=progress)
     return suite
@@ -234,7 +236,7 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
     older: dict[str, Any] = {"train_model": _plain(asdict(TrainModelOptions())), "compile": False}
     if record.exists() and record.stat().st_mtime >= suite.dataset.stat().st_mtime:  # trained on what lies there
         older["dataset"] = key["dataset"]
-    suite.seconds[name] = _unless_done(record, key, train, older)
+    suite.seconds[name] = _unless_done(record, suite.folders[name], key, train, older)
     epochs = len((suite.folders[name] / "curves.csv").read_text().splitlines()) - 1  # the first line names columns
     suite.updates[name] = epochs * (options.ensemble or options).updates_per_epoch
 
@@ -271,13 +273,16 @@ def model_params(name: str, task: str, options: SuiteOptions) -> Params:
     return params
 
 
-def _unless_done(record: Path, settings: dict[str, Any], work: Callable[[], object], older: dict[str, Any]) -> float:
+def _unless_done(
+    record: Path, product: Path, settings: dict[str, Any], work: Callable[[], object], older: dict[str, Any]
+) -> float:
     """Seconds that the work took, now or when it was done with the same settings; `older` completes old records."""
-    if record.exists():
-        done = read_json(record)
-        if _over(older, done.get("settings")) == settings:
-            return done["seconds"]
-    record.unlink(missing_ok=True)  # what lies there is about to be replaced
+    done = read_or_none(record)
+    if not has(done, "settings", "seconds"):
+        refuse_others((record, product), "none of what was kept here; move it, or choose another --work")
+    elif _over(older, done["settings"]) == settings:
+        return done["seconds"]
+    write_json(record, {"settings": None, "seconds": None})  # what lies there is about to be replaced
     begin = time.perf_counter()
     work()
     seconds = time.perf_counter() - begin

@@ -6,7 +6,7 @@ from typing import Any
 
 from envtf_lit.files import replacing
 from envtf_lit.options.schema import Precision
-from envtf_lit.training import fit, record_training, run_folder
+from envtf_lit.training import record_training, run_folder, trained
 from envtf_lit.world_models.lit import lit_world_model, window_data
 from envtf_lit.world_models.options import TrainModelOptions
 from envtf_lit.world_models.store import save_world_model
@@ -47,18 +47,19 @@ def fit_world_model(
     budget = options.ensemble or options
     data = window_data(str(dataset), options, seed=seed)
     lit = lit_world_model(data.observation_dim, data.action_dim, options, seed=seed, compile=compile)
-    curves = fit(
+    with trained(
         lit,
         data,
         run=run_folder(root, "train_model", settings, [dataset]),
+        target=target,
         epochs=budget.updates // budget.updates_per_epoch,
         precision=precision,
         progress=progress,
         monitor=lit.monitor,
         gradient_clip=lit.gradient_clip,
-    )
-    best = curves.rows[-1] if (name := lit.monitor) is None else min(curves.rows, key=lambda row: row[name])
-    return publish_world_model(target, lit, data, curves, best, settings)
+    ) as curves:
+        best = curves.rows[-1] if (name := lit.monitor) is None else min(curves.rows, key=lambda row: row[name])
+        return publish_world_model(target, lit, data, curves, best, settings)
 
 
 def publish_world_model(

@@ -12,7 +12,7 @@ import torch
 from rich.progress import MofNCompleteColumn, TextColumn
 from safetensors.torch import save
 
-from envtf_lit.errors import UserError
+from envtf_lit.errors import UserError, missing_extra
 from envtf_lit.files import read_json, replacing, write_json
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.progress import progress_bar
@@ -126,9 +126,7 @@ def _learner(robot: Robot, recipe: Recipe, seed: int) -> Any:
         import sbx  # pyright: ignore[reportMissingImports]
         from stable_baselines3.common.vec_env import DummyVecEnv  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
-        raise UserError(
-            f"Training behaviour policies needs sbx-rl ({error}): pip install 'envtf-lit[behaviour]'."
-        ) from None
+        raise missing_extra("Training behaviour policies needs sbx-rl", "behaviour", error) from None
     environments = DummyVecEnv([robot.make] * recipe.environments)
     learner = getattr(sbx, recipe.algorithm)
     return learner("MlpPolicy", environments, seed=seed, learning_starts=WARM_UP_STEPS, **recipe.arguments)
