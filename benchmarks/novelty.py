@@ -48,13 +48,13 @@ class Networks(nn.Module):
 
 def tokens(model: EnvironmentTransformer, points: Points) -> tuple[Tensor, Tensor]:
     """Last hidden tokens (N, D), and the normalised pairs (N, S + A) they end in."""
-    last, rows = points.lengths - 1, torch.arange(len(points.actions))
+    last, rows = points.histories.lengths - 1, torch.arange(len(points.actions))
     actions = nn.functional.pad(points.histories.actions, (0, 0, 0, 1))
     actions[rows, last] = points.actions
     with torch.no_grad():
         parts = zip(points.histories.observations.split(1_024), actions.split(1_024), strict=True)
         hidden = torch.cat([model.encode(*part, cached=False)[0] for part in parts])[rows, last]
-        return hidden, model.normaliser.token(points.observations[rows, last], points.actions)
+        return hidden, model.normaliser.token(points.histories.observations[rows, last], points.actions)
 
 
 def train(

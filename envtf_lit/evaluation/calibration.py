@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.statistics import CONSTANT
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.horizon import LARGEST
 from envtf_lit.evaluation.physics import Physics
@@ -23,7 +24,6 @@ from envtf_lit.imagination.rollouts import imagine
 from envtf_lit.policy import Policy
 from envtf_lit.world_models.forecast import Forecast, Scale, Trajectories
 from envtf_lit.world_models.interface import WorldModel
-from envtf_lit.world_models.normaliser import CONSTANT
 from envtf_lit.world_models.uncertainty.recalibration import fitted_factor_and_tail, normal_scores
 from envtf_lit.world_models.uncertainty.tails import crps, half_width, log_density
 
