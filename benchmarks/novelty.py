@@ -18,7 +18,6 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit.data.loaders import Windows
-from envtf_lit.data.options import DownloadOptions
 from envtf_lit.evaluation.calibration import Points, auroc
 from envtf_lit.files import write_json
 from envtf_lit.robots.tasks import ROBOTS, Task, get_task
@@ -85,9 +84,10 @@ def train(
 def refit(model: EnvironmentTransformer, suite: Suite, count: int) -> EnvironmentTransformer:
     """The same network with a posterior that sees so many random features, fitted as after training."""
     options = TransformerOptions(**vars(replace(model.options, random_features=count)))
-    data = window_data(str(suite.dataset), options, held_out=DownloadOptions().held_out, seed=suite.options.seed)
+    data = window_data(str(suite.dataset), options, seed=suite.options.seed)
     data.setup("fit")
     lit = LitWorldModel(model.observation_dim, model.action_dim, options, suite.options.seed)
+    assert isinstance(lit.model, EnvironmentTransformer)
     anew = ("random_features.", "laplace.")
     lit.model.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith(anew)}, strict=False)
     lit.fit_uncertainty(data)

@@ -202,7 +202,9 @@ def test_uniform_actions_replace_the_last_action_alone():
     log = random_log((60, 60))
     points = draw_points(log, 100, history=3, seed=0)
     other = with_uniform_actions(points, log.action_low, log.action_high, seed=0)
-    assert torch.equal(other.histories.observations, points.histories.observations) and torch.equal(other.histories.actions, points.histories.actions)
+    assert torch.equal(other.histories.observations, points.histories.observations) and torch.equal(
+        other.histories.actions, points.histories.actions
+    )
     assert other.actions.dtype == torch.float32
     assert -2 <= other.actions.min() < -1.8 and 2.8 < other.actions.max() <= 3
     assert not torch.isclose(other.actions, points.actions).any()

@@ -172,9 +172,8 @@ class CalibrationData:
         series = read_series(task.robot)
         self.starts, self.physics = pairs(held_out, options.rollouts, stream=1), Physics(task.robot)
         self.expert = load_snapshot(series, series.expert.steps).to(self.device)
-        real = self.in_distribution.observations[
-            torch.arange(len(self.in_distribution.lengths)), self.in_distribution.lengths - 1
-        ]
+        seen = self.in_distribution.histories
+        real = seen.observations[torch.arange(len(seen)), seen.lengths - 1]
         self.deepest = float(self.physics.depth(real.cpu().numpy()).max())
 
     def measure(self, model: WorldModel) -> Findings:

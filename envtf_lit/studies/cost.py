@@ -17,7 +17,6 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from envtf_lit.data.options import DownloadOptions
 from envtf_lit.files import pick_device, write_json
 from envtf_lit.results import claim
 from envtf_lit.robots.tasks import get_task
@@ -94,7 +93,7 @@ def _trial(name: str, task: str, dataset: Path, root: Path, options: SuiteOption
     train = model_options("transformer" if name == "mlp" else name, options)
     if isinstance(train, TransformerOptions) and name == "mlp":
         train = _plain(train, options.ensemble, robot.observation_dim, robot.action_dim)
-    data = window_data(str(dataset), train, held_out=DownloadOptions().held_out, seed=options.seed)
+    data = window_data(str(dataset), train, seed=options.seed)
     clock = Clock()
     lit = lit_world_model(robot.observation_dim, robot.action_dim, train, options.seed, compile=options.compile)
     key = {"trial": time.time_ns(), "options": asdict(train)}  # never continued: its seconds would not be known

@@ -107,7 +107,7 @@ class Suite:
 
     def split(self) -> tuple[OfflineDataset, OfflineDataset | None, OfflineDataset]:
         """The episodes for training, for calibration (None if there are too few), and for testing, of every model."""
-        training, held_out = load_dataset(self.dataset).split(DownloadOptions().held_out, seed=self.options.seed)
+        training, held_out = load_dataset(self.dataset).split()
         return training, *calibration_split(held_out)
 
 
@@ -308,7 +308,6 @@ def _train(params: Params, options: WorldModelOptions, dataset: Path, folder: Pa
         options,
         dataset,
         folder,
-        held_out=params.download.held_out,
         seed=params.seed,
         precision=params.precision,
         compile=params.compile,
