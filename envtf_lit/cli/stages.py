@@ -4,6 +4,7 @@ import argparse
 import os
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from textwrap import fill
 from typing import NamedTuple, NoReturn
 
@@ -25,6 +26,7 @@ class Stage(NamedTuple):
 
 
 STAGES = {
+    "source": Stage(("download",)),
     "download": Stage(("download",)),
     "train_model": Stage(("train_model",), named=True),
     "generate_rollouts": Stage(("generate_rollouts",), named=True),
@@ -53,6 +55,11 @@ def run(name: str, words: Sequence[str]) -> None:
     section = {"name": options.name} if STAGES[name].named else {}
     metrics = stage(params, **section, progress=not options.quiet)
     console().print_json(data=metrics)
+    if overrides and Path("dvc.yaml").exists():
+        console(stderr=True).print(
+            f"params.yaml does not say {' '.join(overrides)}: the next `dvc repro` puts back what it does say. Write "
+            "it there, or use `dvc exp run -S`."
+        )
 
 
 class StageParser(argparse.ArgumentParser):

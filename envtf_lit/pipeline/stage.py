@@ -17,6 +17,7 @@ from envtf_lit.pipeline.params import Params
 from envtf_lit.robots.tasks import Robot, get_task
 from envtf_lit.world_models.options import WorldModelOptions
 
+SOURCE = Path("data/source.json")
 DATASET, CARD = Path("data/dataset.h5"), Path("data/dataset.json")
 WORLD_MODELS, POLICIES = Path("models/world_model"), Path("models/policy")  # a folder below for each name
 ROLLOUTS = Path("data/rollouts")  # a file below for each world model
