@@ -1,8 +1,8 @@
-"""Batches for Lightning: a batch is a draw of row numbers, and the rows come from where they lie.
+"""Lightning data modules and the datasets below them: windows for world models, transitions for agents.
 
-Columns lie on the device as tensors if they fit there; those of a large file stay in it. The batches are the same to
-the bit. Every epoch draws from a generator seeded by (seed, epoch), so a run resumed at an epoch's start sees the same
-rows as one that was never interrupted.
+A batch is a draw of row numbers. Columns lie on the device as tensors if they fit there; those of a large file stay in
+it. The batches are the same to the bit. Every epoch draws from a generator seeded by (seed, epoch), so a run resumed at
+an epoch's start sees the same rows as one that was never interrupted.
 """
 
 from collections.abc import Iterable, Iterator
@@ -187,8 +187,8 @@ class Windows(Dataset[dict[str, Tensor]]):
 class Resamples(Dataset[dict[str, Tensor]]):
     """Bootstrap resamples of windows: as many draws with replacement as there are windows, for each of M members.
 
-    A lone member, who has nobody to differ from, sees every window. Indexed by (M, B) positions, row m within the
-    resample of member m.
+    A single member (M = 1) is given every window once. Indexed by (M, B) positions, row m within the resample of
+    member m.
     """
 
     def __init__(self, windows: Windows, members: int, *, seed: int) -> None:
