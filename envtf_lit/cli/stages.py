@@ -78,7 +78,7 @@ class StageParser(argparse.ArgumentParser):
         """With all options of params.yaml, which take too long to read for another command."""
         from envtf_lit.pipeline.yaml import describe
 
-        lines = ["", "options of params.yaml, each also a flag, such as --seed 1 or --policy.updates=500:"]
+        lines = ["", "options of params.yaml, each also a flag, such as --seed 1 or --policy.updates=9000:"]
         for option in (option for part in (*GLOBAL_OPTIONS, *self.stage.sections) for option in describe(part)):
             default = "null" if option.default is None else option.default
             lines.append(f"  --{option.key}  ({option.kind}, default {default})")
@@ -94,7 +94,7 @@ class StageParser(argparse.ArgumentParser):
         what, _, words = message.partition(": ")
         if what == "unrecognized arguments":
             raise UserError(
-                f"{words.split()[0]!r} is not an option: write --section.key value, such as --policy.updates 500."
+                f"{words.split()[0]!r} is not an option: write --section.key value, such as --policy.updates 9000."
             )
         raise UserError(f"{message[0].upper()}{message[1:]} (see `{self.prog} --help`).")
 
