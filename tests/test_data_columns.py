@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from walker import walker_dataset
 
-from envtf_lit.data.columns import FileRows, column_blocks, moments
+from envtf_lit.data.columns import FileRows
 from envtf_lit.data.dataset import COLUMNS
 from envtf_lit.data.inspection import inspect_source
 from envtf_lit.data.loaders import Store, Transitions, Windows
@@ -68,15 +68,6 @@ def test_a_file_that_is_replaced_does_no_harm(matrix: tuple[np.ndarray, FileRows
     (tmp_path / "new").write_bytes(b"other")
     (tmp_path / "new").replace(tmp_path / "rows")
     assert np.array_equal(np.asarray(rows), array)
-
-
-def test_moments_of_blocks_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch):
-    rows = np.random.default_rng(0).normal(3.0, 2.0, (1000, 4)).astype(np.float32)
-    whole = torch.std_mean(torch.as_tensor(rows).double(), dim=0, correction=0)
-    assert torch.equal(moments([torch.as_tensor(rows)])[1], whole[0])
-    monkeypatch.setattr("envtf_lit.data.columns.BLOCK_BYTES", 16 * 37)
-    mean, std = moments(torch.as_tensor(rows[block]) for block in column_blocks(rows))
-    torch.testing.assert_close((std, mean), whole, rtol=1e-12, atol=0)
 
 
 # datasets

@@ -75,8 +75,8 @@ def test_constant_dimensions_and_rewards():
     text = said(
         dataset, observations=observations, next_observations=observations, actions=actions, rewards=np.ones(240)
     )
-    assert "note: 2 of 11 dimensions of 'observations' are constant (2, 5)" in text
-    assert "warning: 1 of 3 dimensions of 'actions' are constant (1)" in text
+    assert "note: 2 of 11 dimensions of 'observations' are constant in float32 (2, 5)" in text
+    assert "warning: 1 of 3 dimensions of 'actions' are constant in float32 (1)" in text
     assert "every reward is 1" in text
 
 

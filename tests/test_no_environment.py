@@ -124,7 +124,7 @@ def own_params(path: Path) -> Params:
         tiny,
         task=None,
         threads=1,
-        download=DownloadOptions(source="file", path=str(path)),
+        download=DownloadOptions(source="file", path=str(path), held_out=0.25),
         train_model=replace(tiny.train_model, updates=60, updates_per_epoch=30, held_out=0.25),
         generate_rollouts=replace(tiny.generate_rollouts, clone_updates=100, branches=30),
         train_policy=replace(tiny.train_policy, cql=replace(policy, imagination=None), et_cql=policy),
@@ -164,9 +164,10 @@ def test_metrics_hold_no_score_and_only_finite_numbers(finished: tuple[Path, Par
 def test_policies_never_saw_the_held_out_episodes_and_act_in_the_files_own_range(finished: tuple[Path, Params]):
     from envtf_lit.policy import load_policy
 
-    root, params = finished
+    root, _ = finished
     dataset = load_dataset(root / "data/dataset.h5")
-    training, _ = dataset.split(params.train_model.held_out, seed=params.seed)
+    training, held_out = dataset.split()
+    assert len(held_out.episode_starts) == 3
     for folder in ("behaviour", "policy/cql", "policy/et_cql"):
         policy = load_policy(root / "models" / folder)
         mean, _ = training.observation_scale()

@@ -2,7 +2,7 @@
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -15,7 +15,7 @@ from envtf_lit.agents.options import NO_WORLD_MODEL, PolicyOptions
 from envtf_lit.data.loaders import TransitionData, epoch_generator
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.buffer import ImaginedBatches
-from envtf_lit.options.schema import build, rebuild
+from envtf_lit.options.schema import build
 from envtf_lit.policy import TanhGaussianActor, load_policy
 
 Batch = dict[str, Tensor]
@@ -125,8 +125,9 @@ class Agent(L.LightningModule, ABC):
         if self.imagines is not (source is not None):
             needs = "learns in a world model: give it one" if self.imagines else "learns from data alone"
             raise UserError(f"{self.label} {needs} (world_model is {(options and _world_model(options))!r}).")
-        plain = options if isinstance(options, Mapping) else None
-        self.options = build(self.Options, plain, "") if plain is not None else rebuild(options or self.Options())
+        if not isinstance(options, dict):
+            options = asdict(options or self.Options())
+        self.options = build(self.Options, options, "")
         self.save_hyperparameters(
             dict(
                 observation_dim=observation_dim,

@@ -100,7 +100,7 @@ def return_weights(dataset: OfflineDataset, temperature: float) -> Tensor:
     A log that is mostly poor then teaches what its best episodes did; a small temperature means a sharp preference.
     """
     returns = dataset.episode_returns
-    scaled = (returns - returns.min()) / max(returns.max() - returns.min(), 1e-9)
+    scaled = (returns - returns.min()) / (np.ptp(returns) or 1.0)  # 1: all are equal
     return torch.as_tensor(np.exp((scaled - 1.0) / temperature)[dataset.episode_index])
 
 
@@ -263,8 +263,8 @@ class WindowData(L.LightningDataModule):
         context: steps per window; the model's context.
         batch_size: windows per batch and process.
         updates_per_epoch: batches per epoch.
-        held_out: share of the episodes kept for validation.
-        seed: of the split and of all draws.
+        held_out: share of the episodes kept for validation, where the dataset does not say which they are.
+        seed: of all draws, and of that split.
         members: of an ensemble, each of which has its own bootstrap resample of the training windows; its batches come
             first in the shape, (members, batch_size, context, …). None gives plain windows.
     """
@@ -331,8 +331,9 @@ class TransitionData(L.LightningDataModule):
         discount: of future rewards, per step.
         n_step: steps whose rewards enter the temporal-difference target.
         return_temperature: of `return_weights`; None draws rows uniformly.
-        held_out: share of the episodes left out, the ones that `WindowData` holds out with the same share and seed.
-        seed: of the split and of all draws.
+        held_out: 0 takes all episodes; more leaves out those that the dataset says are held out, else that share of
+            them, the ones that `WindowData` holds out with the same share and seed.
+        seed: of all draws, and of that split.
     """
 
     def __init__(

@@ -11,15 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.horizon import HorizonReport
 from envtf_lit.policy import Policy
 from envtf_lit.world_models.forecast import Trajectories
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.unroll import unroll
-
-LIVE = 1e-6  # an action dimension that varies less has no choice to agree about
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +99,7 @@ def _bounded(rewards: Tensor, training: OfflineDataset) -> Tensor:
 
 def action_error(policy: Policy, held_out: Trajectories, training: OfflineDataset) -> float:
     """See `OfflineEstimate.action_error`; zero where no action dimension varies."""
-    _, spread = moments(torch.as_tensor(training.actions[rows]) for rows in column_blocks(training.actions))
-    live = spread > LIVE
+    spread, live = training.statistics.actions.std, training.statistics.actions.live
     chosen = policy.act(held_out.observations[held_out.valid], True).cpu().double()
     error = (chosen - held_out.actions[held_out.valid].cpu().double())[:, live] / spread[live]
     return float(error.square().mean()) if bool(live.any()) else 0.0

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from IPython.display import HTML, Image, Markdown, display
+from IPython.display import HTML, Markdown, display
 
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.comparison import Comparison, compare
@@ -120,13 +120,11 @@ class Run:
 
     def plot(self, name: str) -> None:
         """Displays a plot of the evaluate stage."""
-        display(Image(self.root / f"reports/plots/{name}.png", alt=name.replace("_", " ")))
+        _show_picture(self.root / f"reports/plots/{name}.png", name.replace("_", " "))
 
     def video(self) -> None:
         """Displays the video of the evaluate stage."""
-        movie = base64.b64encode((self.root / "reports/video/real_vs_imagined.gif").read_bytes()).decode()
-        alt = "real and imagined robot, side by side"
-        display(HTML(f'<img alt="{alt}" src="data:image/gif;base64,{movie}">'))  # nbconvert knows no image/gif
+        _show_picture(self.root / "reports/video/real_vs_imagined.gif", "real and imagined robot, side by side")
 
 
 def read_run(root: str | Path, *, simulator: bool) -> Run:
@@ -182,3 +180,9 @@ def say(*sentences: str) -> None:
 def show(table: pd.DataFrame) -> None:
     """Displays a table of text, without row numbers."""
     display(HTML(table.to_html(index=False, border=0)))
+
+
+def _show_picture(path: Path, text: str) -> None:
+    """As HTML, for nbconvert shows no GIF otherwise, and gives no picture a text for those who cannot see it."""
+    content = base64.b64encode(path.read_bytes()).decode()
+    display(HTML(f'<img alt="{text}" src="data:image/{path.suffix[1:]};base64,{content}">'))

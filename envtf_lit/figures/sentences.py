@@ -74,6 +74,7 @@ def about_data(run: Run) -> str:
     return _joined(
         f"{card['transitions']:,} transitions in {card['episodes']:,} episodes, of {card['episode_steps']['mean']:.0f}",
         f"steps on average; {card['terminated'] / card['episodes']:.0%} of them end in a termination, such as a fall.",
+        f"Actions lie in [{min(card['action_low']):g}, {max(card['action_high']):g}].",
         f"{card['cut_short']} are cut short and not counted." if 0 < card["cut_short"] < card["episodes"] else "",
         f"The mean {unit} is {run.number(average)}, the best episode's {run.number(best)}.",
     )
@@ -193,8 +194,8 @@ def about_median_episode(run: Run) -> str:
     traces = run.table("traces")
     strayed = (traces["imagined"] - traces["recorded"]).abs() > (traces["upper"] - traces["lower"]) / 2
     return _joined(
-        f"{traces['step'].max()} steps are shown. In {strayed.mean():.0%} of the values the record lies outside the band,",
-        "which is of a single step: it does not know how far the imagined state before it has strayed.",
+        f"{traces['step'].max()} steps are shown. In {strayed.mean():.0%} of the values the record lies outside the",
+        "band, which is of a single step: it does not know how far the imagined state before it has strayed.",
     )
 
 

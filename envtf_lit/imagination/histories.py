@@ -37,6 +37,11 @@ class Histories:
         used, window = self.window[rollouts].unique(return_inverse=True)
         return Histories(self.observations[used], self.actions[used], self.lengths[rollouts], window)
 
+    def to(self, device: torch.device | str) -> "Histories":
+        """The same on another device."""
+        columns = self.observations, self.actions, self.lengths, self.window
+        return Histories(*(column if column is None else column.to(device) for column in columns))  # pyright: ignore[reportArgumentType]
+
     def begin(self, model: WorldModel, *, posterior: float = 0.0, generator: torch.Generator | None = None) -> Any:
         """The model's state after these histories; arguments as of `WorldModel.init`."""
         columns = self.observations, self.actions, self.lengths, self.window

@@ -54,13 +54,13 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         dataset, rollouts = load_dataset(root / DATASET), load_rollouts(rollouts_file(root, name))
         folder = root / WORLD_MODELS / name
         model = load_world_model(folder)
-        training, held_out = dataset.split(params.download.held_out, seed=params.seed)
+        training, held_out = dataset.split()
         _, held_out = calibration_split(held_out)
         scale = Scale.of(training)
         report = horizon_report(model, whole_episodes(held_out, options.trajectories, seed=params.seed), scale)
         policies = {policy: load_policy(root / POLICIES / policy) for policy in params.train_policy}
         curves = {policy: _curves(root / POLICIES / policy) for policy in policies}
-        facts = dict(
+        facts: dict[str, Any] = dict(
             seed=params.seed,
             dataset=dataset,
             world_model={"name": name}

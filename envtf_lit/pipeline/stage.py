@@ -44,7 +44,7 @@ def unseen(params: Params) -> dict[str, float]:
 def run_settings(params: Params, options: WorldModelOptions | PolicyOptions | Any) -> dict[str, Any]:
     """What a run's result depends on, beside its input files."""
     common = {name: getattr(params, name) for name in ("seed", "threads", "precision", "compile")}
-    return common | {"held_out": params.download.held_out, "options": asdict(options)}
+    return common | {"options": asdict(options)}
 
 
 @contextlib.contextmanager

@@ -42,9 +42,9 @@ def lit_world_model(
     return kind(observation_dim, action_dim, options, seed, init_from, freeze, compile)
 
 
-def window_data(path: str, options: WorldModelOptions, *, held_out: float, seed: int) -> WindowData:
+def window_data(path: str, options: WorldModelOptions, *, seed: int) -> WindowData:
     """The data module of windows that such options are trained on."""
-    return WindowData(path, **window_options(options), held_out=held_out, seed=seed)
+    return WindowData(path, **window_options(options), seed=seed)
 
 
 def window_options(options: WorldModelOptions) -> dict[str, Any]:

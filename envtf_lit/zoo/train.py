@@ -182,7 +182,7 @@ def _keep(actor: TanhGaussianActor, robot: Robot, steps: int, folder: Path) -> S
     )
 
 
-def settle(robot: Robot, zoo: Path, *, last: int = 3, noise: float = 0.5) -> Snapshot:
+def average_last_snapshots(robot: Robot, zoo: Path, *, last: int = 3, noise: float = 0.5) -> Snapshot:
     """Exchanges a series' last snapshot for a calmer one: the late snapshots' mean weights, with less noise.
 
     A constant learning rate leaves a learner circling its optimum; the mean of late weights lies nearer to it
