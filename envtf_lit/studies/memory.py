@@ -11,10 +11,11 @@ import torch
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.evaluation.in_context import Recognition, recognition, recognition_metrics, stretches
 from envtf_lit.figures.in_context import recognition_curves
-from envtf_lit.files import pick_device, write_json
+from envtf_lit.files import write_json
 from envtf_lit.results import claim
 from envtf_lit.robots.tasks import Task, get_task
 from envtf_lit.studies.suite import WORK, Suite, SuiteOptions, build_suite, flat_settings, heading, kept, measurable
+from envtf_lit.training import pick_device
 from envtf_lit.world_models.forecast import Scale
 from envtf_lit.zoo.collect import collect
 from envtf_lit.zoo.snapshots import plan
