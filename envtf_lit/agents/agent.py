@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from envtf_lit import training
 from envtf_lit.agents.options import NO_WORLD_MODEL, PolicyOptions
-from envtf_lit.data.loaders import TransitionData, epoch_generator
+from envtf_lit.data.datamodules import TransitionData
+from envtf_lit.data.loaders import epoch_generator
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.buffer import ImaginedBatches
 from envtf_lit.options.schema import build
