@@ -131,8 +131,9 @@ class Agent(L.LightningModule, ABC):
             raise UserError(
                 f"{self.label} learns from data alone and is given a source of imagined rows: leave it out."
             )
-        plain = isinstance(options, Mapping)
-        self.options = build(self.Options, options, "") if plain else rebuild(options or self.Options())
+        if not isinstance(options, dict):
+            options = asdict(options or self.Options())
+        self.options = build(self.Options, options, "")
         self.save_hyperparameters(
             dict(
                 observation_dim=observation_dim,
