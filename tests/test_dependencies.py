@@ -168,7 +168,7 @@ def test_init_says_how_to_get_dvc(
 ) -> None:
     main(["init", str(tmp_path / "with")])
     assert "pip install" not in capsys.readouterr().out
-    monkeypatch.setattr("envtf_lit.cli.main.find_spec", lambda name: None)
+    monkeypatch.setattr("envtf_lit.cli.project.find_spec", lambda name: None)
     main(["init", str(tmp_path / "without")])
     assert "Next: pip install 'envtf-lit[pipeline]' && cd" in capsys.readouterr().out
 
