@@ -24,8 +24,9 @@ import torch
 
 from envtf_lit.agents.cql import CQL
 from envtf_lit.data.columns import blocks
+from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import TransitionData, WindowData, Windows
+from envtf_lit.data.loaders import Windows
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.pipeline.params import Params
 from envtf_lit.training import trained

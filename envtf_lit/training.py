@@ -216,6 +216,15 @@ def freeze(module: nn.Module, parts: Sequence[str]) -> None:
         raise UserError(f"Freezing {', '.join(parts)} leaves nothing to train: freeze less.")
 
 
+def pick_device() -> torch.device:
+    """The accelerator if there is one, else the CPU."""
+    if torch.accelerator.is_available():
+        accelerator = torch.accelerator.current_accelerator()
+        assert accelerator is not None
+        return accelerator
+    return torch.device("cpu")
+
+
 def autocast(device: torch.device, precision: Precision) -> torch.autocast:
     """bf16 matrix products where the parameters ask for them."""
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")

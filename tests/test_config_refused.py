@@ -41,7 +41,7 @@ REFUSED = {
     "policy: {hidden: []}": ["policy.hidden is []", "a list"],
     "policy: {hidden: [8, 0]}": ["policy.hidden is 0", "more than 0"],
     "policy: {layer_norm: 1}": ["policy.layer_norm is 1", "true or false"],
-    "policy: {warm_start: 1500}": ["policy.warm_start is 1500", "in [0, 1)"],
+    "policy: {warm_start: -1}": ["policy.warm_start is -1", "0 or more"],
     "policy: {target_rate: 0}": ["policy.target_rate is 0", "in (0, 1]"],
     "policy: {cql_weight: 1}": ["'cql_weight' in policy"],
     "train_model: 3": ["train_model is 3", "one section or more"],

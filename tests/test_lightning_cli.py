@@ -16,7 +16,8 @@ from envtf_lit import load_policy, load_world_model
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.cli.main import main
-from envtf_lit.data.loaders import TransitionData, Transitions
+from envtf_lit.data.datamodules import TransitionData
+from envtf_lit.data.loaders import Transitions
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.data.sources.minari import write_minari
 from envtf_lit.errors import UserError

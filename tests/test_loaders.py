@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import (
-    DrawSampler,
-    TransitionData,
-    Transitions,
-    WindowData,
-    Windows,
-    epoch_generator,
-    return_weights,
-)
+from envtf_lit.data.loaders import DrawSampler, Transitions, Windows, epoch_generator, return_weights
 from envtf_lit.data.sources.files import save_dataset
 
 

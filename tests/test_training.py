@@ -13,8 +13,8 @@ from lightning.pytorch.callbacks import Callback
 
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.data.sources.files import save_dataset
-from envtf_lit.files import load_weights
 from envtf_lit.imagination.options import ImaginationOptions, ValueGradientOptions
+from envtf_lit.modules import load_weights
 from envtf_lit.pipeline.generate_rollouts import generate_rollouts
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.stage import WORLD_MODEL

@@ -1,4 +1,4 @@
-"""Every check a dataset passes once, on its way in: what comes out is complete, finite and consistent."""
+"""Checks of columns as read from a file, and the `OfflineDataset` made of those that pass."""
 
 import math
 from collections import Counter

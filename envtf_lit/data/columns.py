@@ -1,4 +1,4 @@
-"""Columns of rows, in memory or in their file, and passes over them that take little memory either way."""
+"""Columns of rows, in memory or in their file, and the blocks in which both are read."""
 
 import os
 import weakref

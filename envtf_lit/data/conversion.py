@@ -1,4 +1,4 @@
-"""Datasets from one format to another, and what that changes."""
+"""Conversion of datasets between HDF5, NPZ and Minari, and what that changes."""
 
 from collections.abc import Sequence
 from pathlib import Path

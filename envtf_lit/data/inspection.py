@@ -1,4 +1,4 @@
-"""What `envtf data check` finds in a dataset: all of its facts and all of its problems at once, never a traceback."""
+"""The report of `envtf data check`: all facts and all problems of a dataset at once, never a traceback."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field

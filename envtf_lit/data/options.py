@@ -1,4 +1,4 @@
-"""The options of the dataset."""
+"""The options of the stage `download`."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,7 @@
-"""What can be said of a policy without its environment: what the model promises it, and how far it agrees with the log.
+"""Estimates of policies without their environment: returns that the world model imagines, and agreement with the log.
 
-An imagined return is the world model's opinion. It is printed beside what the same model says of the recorded actions,
-whose true return the log knows: that difference is how wrong the opinion can be.
+An imagined return is an estimate by the world model. It stands beside the same model's estimate for the recorded
+actions, whose true return the log knows: that difference is how wrong the estimate can be.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from envtf_lit.world_models.unroll import unroll
 
 @dataclass(frozen=True, eq=False)
 class OfflineEstimate:
-    """What is known of one policy without its environment.
+    """The estimate for one policy without its environment.
 
     Attributes:
         returns: (E,) float64, imagined return from the first state of each held-out episode, over as many steps as
@@ -36,11 +36,11 @@ class OfflineEstimate:
 
 @dataclass(frozen=True, eq=False)
 class OfflineEstimates:
-    """What is known of policies without their environment.
+    """The estimates for policies without their environment, and for the recorded actions.
 
     Attributes:
         recorded: (E,) float64, true returns of the held-out episodes.
-        imagined: (E,) float64, what the model, on its own predictions, makes of the same actions.
+        imagined: (E,) float64, returns that the model, on its own predictions, imagines of the recorded actions.
         policies: by name.
     """
 
@@ -52,7 +52,7 @@ class OfflineEstimates:
 def evaluate_offline(
     model: WorldModel, policies: Mapping[str, Policy], report: HorizonReport, training: OfflineDataset
 ) -> OfflineEstimates:
-    """The policies in the world model, and beside the log.
+    """Estimates each policy in the world model, and compares its actions with the log's.
 
     Args:
         model: in eval mode, on the device of the report's trajectories.
@@ -76,9 +76,9 @@ def evaluate_offline(
 
 @torch.no_grad()
 def imagined_returns(model: WorldModel, policy: Policy, held_out: Trajectories, training: OfflineDataset) -> np.ndarray:
-    """(E,) returns of mean predictions under deterministic actions; no rule ends an episode before its recorded end.
+    """Imagined returns (E,): of mean predictions under deterministic actions, each for as long as the record lasted.
 
-    Rewards are cut to the range of the training data's, so that a model that runs away promises no more than was ever
+    Rewards are cut to the range of the training data's, so that a model that runs away imagines no more than was ever
     paid.
     """
     first, no_actions = held_out.observations[:, :1], held_out.actions[:, :0]

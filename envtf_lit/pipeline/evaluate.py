@@ -5,6 +5,7 @@ from typing import Any
 
 import pandas as pd
 
+from envtf_lit.agents.options import NO_WORLD_MODEL
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
@@ -91,6 +92,9 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
                 gallery.draw_scores(dataset, source, robot, returns, _labels(params), plots)
                 episode, gif = list(returns.values())[-1].median, video / "real_vs_imagined.gif"
                 real_vs_imagined(model, episode, robot, scale, gif, frames=options.video_frames)
+        for policy, options in params.train_policy.items():
+            imagined_in = None if options.world_model == NO_WORLD_MODEL else options.world_model
+            metrics["policies"][policy] |= {"algorithm": algorithm_of(options), "world_model": imagined_in}
         write_json(root / METRICS, metrics)
     return metrics
 

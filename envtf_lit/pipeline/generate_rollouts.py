@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from envtf_lit.data.sources.files import load_dataset
-from envtf_lit.files import check_writable, pick_device
+from envtf_lit.files import check_writable
 from envtf_lit.imagination.histories import BranchPoints
 from envtf_lit.imagination.rollouts import NoisyPolicy, Rollouts, imagine
 from envtf_lit.imagination.store import save_rollouts
@@ -22,7 +22,7 @@ from envtf_lit.pipeline.stage import (
     run_stage,
 )
 from envtf_lit.policy import load_policy
-from envtf_lit.training import autocast
+from envtf_lit.training import autocast, pick_device
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination import termination_rule
 

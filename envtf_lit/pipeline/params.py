@@ -133,8 +133,15 @@ def _policies(common: CommonOptions, sections: Mapping[str, Any]) -> Iterator[tu
 
 
 def algorithm_of(options: PolicyOptions) -> str:
-    """The name of the algorithm that has these options."""
-    return next(name for name, algorithm in ALGORITHMS.items() if algorithm.Options is type(options))
+    """The name of the algorithm that has these options.
+
+    Raises:
+        UserError: several have them.
+    """
+    found = [name for name, algorithm in ALGORITHMS.items() if algorithm.Options is type(options)]
+    if len(found) > 1:  # one would be trained in place of the other
+        raise UserError(f"{' and '.join(found)} have {type(options).__name__} in common: give each options of its own.")
+    return found[0]
 
 
 def kind_of(options: WorldModelOptions) -> str:
@@ -171,14 +178,14 @@ def check_rules(params: Params) -> None:
         _check_history("generate_rollouts", first.history, name, model)
         _check_epistemic("generate_rollouts.novelty_limit", first.novelty_limit, name, model)
     one_of("train_model", params.train_model, params.evaluate.world_model)
+    for name, policy in params.train_policy.items():
+        _check_policy(f"train_policy.{name}", policy, params)
     one_of("train_policy", params.train_policy, first.policy)
     if params.train_policy[first.policy].world_model != NO_WORLD_MODEL:
         raise UserError(
             f"generate_rollouts.policy is {first.policy}, which itself learns from imagined rollouts: name one from "
             "data alone, such as bc."
         )
-    for name, policy in params.train_policy.items():
-        _check_policy(f"train_policy.{name}", policy, params)
 
 
 def _check_policy(section: str, options: PolicyOptions, params: Params) -> None:

@@ -63,7 +63,7 @@ def _torn_mujoco() -> dict[str, str]:
 def _torch() -> dict[str, str]:
     import torch
 
-    from envtf_lit.files import pick_device
+    from envtf_lit.training import pick_device
 
     device = pick_device()
     name = torch.cuda.get_device_name() if torch.cuda.is_available() else ""

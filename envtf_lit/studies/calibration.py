@@ -27,11 +27,12 @@ from envtf_lit.evaluation.calibration import (
 )
 from envtf_lit.evaluation.physics import Physics
 from envtf_lit.figures.calibration import calibration_page
-from envtf_lit.files import pick_device, write_text
+from envtf_lit.files import write_text
 from envtf_lit.robots.returns import SEED_OFFSET
 from envtf_lit.robots.tasks import Task
 from envtf_lit.studies.study import Study
 from envtf_lit.studies.suite import MODELS, Suite, cached_result, flat_settings, load_for_study
+from envtf_lit.training import pick_device
 from envtf_lit.world_models.forecast import Scale, forecast, whole_episodes
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.zoo.collect import collect

@@ -15,10 +15,11 @@ from typing import Any
 import pandas as pd
 
 from envtf_lit.data.sources.files import save_dataset
-from envtf_lit.files import pick_device, write_json
+from envtf_lit.files import write_json
 from envtf_lit.results import claim
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.studies.machine import facts
+from envtf_lit.training import pick_device
 from envtf_lit.zoo.collect import collect
 
 BASE, TARGET = "hopper-medium-replay", "hopper-medium-replay-hidden"

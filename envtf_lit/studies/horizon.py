@@ -14,12 +14,12 @@ from envtf_lit.evaluation.horizon import THRESHOLDS
 from envtf_lit.evaluation.physics import Physics, ceiling
 from envtf_lit.evaluation.tracking import Tracking, fresh_episodes, track, track_ceiling, track_sampled
 from envtf_lit.figures import horizons
-from envtf_lit.files import pick_device, write_text
+from envtf_lit.files import write_text
 from envtf_lit.robots.returns import SEED_OFFSET
 from envtf_lit.robots.tasks import Task
 from envtf_lit.studies.study import Study
 from envtf_lit.studies.suite import PHYSICS, Suite, cached_result, flat_settings, load_for_study
-from envtf_lit.training import run_folder
+from envtf_lit.training import pick_device, run_folder
 from envtf_lit.world_models.forecast import Scale, Trajectories, whole_episodes
 
 ONLINE = ("random", "medium", "expert")  # policies of the zoo that drive MuJoCo

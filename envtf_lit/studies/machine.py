@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 from envtf_lit.errors import UserError
-from envtf_lit.files import pick_device
 from envtf_lit.options.schema import Precision
+from envtf_lit.training import pick_device
 
 PACKAGES = ("torch", "lightning", "gymnasium", "mujoco", "numpy")
 

@@ -21,7 +21,7 @@ from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.fetch import sha256
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.files import pick_device, read_json, write_json
+from envtf_lit.files import read_json, write_json
 from envtf_lit.options.schema import Precision, rebuild
 from envtf_lit.pipeline.download import download
 from envtf_lit.pipeline.params import Params
@@ -29,7 +29,7 @@ from envtf_lit.pipeline.stage import CARD, DATASET, run_settings
 from envtf_lit.results import has, read_or_none, refuse_others
 from envtf_lit.robots.tasks import Robot, Task, get_task
 from envtf_lit.studies.machine import hardware
-from envtf_lit.training import run_folder
+from envtf_lit.training import pick_device, run_folder
 from envtf_lit.world_models.fit import fit_world_model
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions, WorldModelOptions

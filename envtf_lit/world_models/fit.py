@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from envtf_lit.data.loaders import WindowData
+from envtf_lit.data.datamodules import WindowData
 from envtf_lit.files import replacing
 from envtf_lit.options.schema import Precision
 from envtf_lit.training import Curves, record_training, run_folder, trained

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from envtf_lit import training
-from envtf_lit.data.loaders import WindowData, epoch_generator
+from envtf_lit.data.datamodules import WindowData
+from envtf_lit.data.loaders import epoch_generator
 from envtf_lit.errors import UserError
 from envtf_lit.options.schema import build
 from envtf_lit.world_models.ensemble import EnsembleDynamics

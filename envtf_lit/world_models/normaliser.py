@@ -1,4 +1,4 @@
-"""The scales between the data's units and the network's: buffers of the model, so that they are saved with it."""
+"""The z-scoring of a world model's inputs and targets: buffers of the model, saved with it."""
 
 import torch
 from torch import Tensor, nn

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from envtf_lit.data.columns import column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import epoch_generator
-from envtf_lit.files import load_module, save_module
+from envtf_lit.modules import load_module, save_module
 from envtf_lit.robots.tasks import get_task, never_terminated
 
 HIDDEN, UPDATES, BATCH, LEARNING_RATE = 64, 2_000, 256, 0.003

@@ -1,4 +1,4 @@
-"""D4RL-style HDF5 and NPZ files, in both directions. docs/datasets.md names the columns.
+"""Reading and writing of D4RL-style HDF5 and NPZ files; docs/datasets.md names the columns.
 
 Nothing in a file can run code or lead elsewhere: no objects, no pickle, no links, no storage outside the file, no
 filters but HDF5's own, no sizes that the file itself cannot hold.

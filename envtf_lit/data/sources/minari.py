@@ -1,4 +1,4 @@
-"""Minari datasets (https://minari.farama.org), in both directions.
+"""Reading and writing of Minari datasets (https://minari.farama.org).
 
 Nothing in a Minari folder is run: the environment that its metadata name is made by `recover_environment()` alone, when
 its user asks for it, never here.
