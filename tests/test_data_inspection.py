@@ -199,7 +199,7 @@ def test_convert_states_the_limits_that_a_file_does_not(tmp_path: Path, capsys: 
     with pytest.raises(SystemExit):
         main(["data", "convert", str(source), str(target)])
     assert "state the robot's own" in capsys.readouterr().err and not target.exists()
-    main(["data", "convert", str(source), str(target), "--action_low", "-0.4", "--action_high", "0.4", "0.5", "0.4"])
+    main(["data", "convert", str(source), str(target), "--action-low", "-0.4", "--action-high", "0.4", "0.5", "0.4"])
     dataset = load_dataset(target)
     assert dataset.action_low.tolist() == [np.float32(-0.4)] * 3
     assert dataset.action_high.tolist() == np.array([0.4, 0.5, 0.4], np.float32).tolist()

@@ -31,8 +31,8 @@ def convert(
     /,
     *,
     task: str | None = None,
-    action_low: list[float] | None = None,
-    action_high: list[float] | None = None,
+    action_low: tuple[float, ...] | None = None,
+    action_high: tuple[float, ...] | None = None,
 ) -> None:
     """Writes a dataset in another format.
 

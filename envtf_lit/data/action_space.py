@@ -25,7 +25,7 @@ FILLED = 0.9  # of the way from 0 to a limit: actions that reach less far speak 
 FEW = 32  # different whole numbers, of which a discrete action space may consist
 STATE = (
     "state the robot's own: 'action_low' and 'action_high' in the file, as attributes or arrays, or "
-    "`envtf data convert IN OUT --action_low LOW --action_high HIGH`"
+    "`envtf data convert IN OUT --action-low LOW --action-high HIGH`"
 )
 
 
