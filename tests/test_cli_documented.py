@@ -14,7 +14,7 @@ from envtf_lit.cli.command import parse_words
 from envtf_lit.cli.commands import COMMANDS, GROUPS
 from envtf_lit.cli.components import LogTransitions, LogWindows, agent_of, world_model_of
 from envtf_lit.cli.stages import STAGES, StageParser, split
-from envtf_lit.data.loaders import TransitionData, WindowData
+from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.pipeline.yaml import load_params
 from envtf_lit.world_models.options import KINDS
 from tests.test_cli import LIGHTNING
