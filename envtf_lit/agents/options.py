@@ -31,8 +31,8 @@ class CommonOptions:
         actor_learning_rate: Adam's.
         actor_schedule: of the actor's learning rate after the warm start: `constant`, or half a cosine to zero.
         critic_learning_rate: Adam's.
-        warm_start: first updates, in which critics fit Monte-Carlo returns and the actor clones the data, for algorithms
-            that have both; below 1 as a share of all updates, from 1 on as their number, of which all are the most.
+        warm_start: first updates, in which critics fit Monte-Carlo returns and the actor clones the data, for
+            algorithms that have both; below 1 as a share of all updates, from 1 on as their number, at most all.
         actor_average: share of the actor that enters the averaged actor at each update; the average is what is saved.
     """
 
