@@ -69,7 +69,7 @@ def test_uncertainty_is_charged_for_in_units_of_the_datas_rewards():
 def test_rewards_are_divided_by_the_return_scale():
     source = begun(scale=4.0)
     assert held(source, "rewards") == [0.25] * 10
-    source.add_rollouts(made_rollouts([[2.0]]))
+    source.add_rollouts(made_rollouts([[2.0]]), horizon=1)
     assert held(source, "rewards")[0] == 0.5  # over the oldest
 
 
@@ -86,8 +86,11 @@ def test_one_step_transitions_end_where_they_end():
 def test_steps_of_the_value_expansion_enter_targets_but_not_the_ring():
     """Two of three steps lie behind the horizon; the third rollout falls before it gets there."""
     rewards = [[1.0, 1.0, 1.0], [2.0, 2.0, 2.0], [4.0, 4.0, 4.0]]
-    stored = made_rollouts(rewards, lengths=[3, 2, 2], fallen=(2,))
-    source = begun(stored, horizon=1, value_expansion=2, discount=0.5)
+    rollouts = made_rollouts(rewards, lengths=[3, 2, 2], fallen=(2,))
+    source = begun(rollouts, horizon=1, value_expansion=2, discount=0.5)
+    assert len(held(source, "observations")) == 3 + 2 + 2  # of the stored ones, every step is learned from
+    source.ring.count.zero_()
+    source.add_rollouts(rollouts, horizon=1)
     assert held(source, "observations") == [0.0, 10.0, 20.0]
     assert held(source, "next_observations") == [3.0, 12.0, 22.0]
     assert held(source, "rewards") == [1.0 + 1.0 + 1.0, 1.0 + 1.0, 1.0 + 1.0]
@@ -116,7 +119,9 @@ def test_the_ring_holds_a_few_rounds_of_rollouts():
     source = begun(refresh_every=1, branches=4, horizon=2, value_expansion=1)
     assert len(source.ring) == 10  # the stored ones
     for level in (2.0, 3.0, 4.0, 5.0):
-        source.add_rollouts(made_rollouts([[level] * 4, [level] * 4, [level] * 4]))
+        source.add_rollouts(
+            made_rollouts([[level] * 4, [level] * 4, [level] * 4]), horizon=source.imagination.options.horizon
+        )
     assert len(source.ring) == ROUNDS_KEPT * 4 * 2
     assert sorted(held(source, "observations")) == sorted([0.0, 10.0, 20.0, 30.0, 1.0, 11.0, 21.0, 31.0] * ROUNDS_KEPT)
     assert min(held(source, "rewards")) > 5.0 - 1.0 and 1.0 not in held(source, "rewards")
@@ -138,7 +143,7 @@ def test_the_ring_is_part_of_checkpoints():
     first, second = (hand_driven(COMBO, source=imagined_batches(refresh_every=2)) for _ in range(2))
     for agent in (first, second):
         agent.source.begin(torch.tensor(2.0))
-    first.source.add_rollouts(made_rollouts([[7.0, 8.0]]))
+    first.source.add_rollouts(made_rollouts([[7.0, 8.0]]), horizon=1)
     assert held(second.source, "rewards") != held(first.source, "rewards")
     second.load_state_dict(first.state_dict())
     assert held(second.source, "rewards") == held(first.source, "rewards") and len(second.source.ring) == 12

@@ -188,7 +188,7 @@ def test_points_are_late_pairs_with_the_steps_before_them():
     log = random_log((12, 8, 15))  # two late rows, none, and five
     points = draw_points(log, 100, history=3, seed=0)
     rows = [10, 11, 30, 31, 32, 33, 34]
-    assert points.lengths.tolist() == [4] * 7
+    assert points.histories.lengths.tolist() == [4] * 7
     for i, row in enumerate(rows):
         np.testing.assert_array_equal(points.histories.observations[i], log.observations[row - 3 : row + 1])
         np.testing.assert_array_equal(points.histories.actions[i], log.actions[row - 3 : row])
@@ -264,7 +264,7 @@ def test_errors_are_those_of_each_step_from_the_imagined_state():
     data, model = linear_data((40, 40)), linear_world(error=0.05, std=0.3)
     starts, scale = draw_points(data, 6, history=2, seed=0), Scale.of(data)
     run = rollout_errors(model, Still(), starts, TrueWorld(linear_world()), scale, steps=4)  # pyright: ignore
-    state, expected = starts.observations[torch.arange(6), starts.lengths - 1], []
+    state, expected = starts.histories.present, []
     first = state[:, 0]
     for _ in range(4):
         imagined, true = state @ model.matrix.T, state @ linear_world().matrix.T
@@ -279,7 +279,7 @@ def test_errors_are_those_of_each_step_from_the_imagined_state():
 def test_what_the_simulator_cannot_take_is_left_out_and_counted():
     data = linear_data((40, 40))
     starts, scale = draw_points(data, 10, history=2, seed=0), Scale.of(data)
-    states = starts.observations[torch.arange(10), starts.lengths - 1].abs().amax(1)
+    states = starts.histories.present.abs().amax(1)
     physics = TrueWorld(linear_world(), limit=float(states.median()))
     run = rollout_errors(linear_world(), Still(), starts, physics, scale, steps=1)  # pyright: ignore
     assert len(run.error) == len(run.uncertainty) == 5
@@ -290,7 +290,7 @@ def test_what_the_simulator_cannot_take_is_left_out_and_counted():
 def test_states_whose_velocity_was_clipped_are_left_out_and_counted():
     data = linear_data((40, 40))
     starts, scale = draw_points(data, 10, history=2, seed=0), Scale.of(data)
-    states = starts.observations[torch.arange(10), starts.lengths - 1].abs().amax(1).sort().values
+    states = starts.histories.present.abs().amax(1).sort().values
     physics = TrueWorld(linear_world(), limit=float(states[7]), clip=float(states[5]))
     run = rollout_errors(linear_world(), Still(), starts, physics, scale, steps=1)  # pyright: ignore
     assert len(run.error) == 5

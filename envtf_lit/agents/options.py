@@ -32,7 +32,7 @@ class CommonOptions:
         actor_schedule: of the actor's learning rate after the warm start: `constant`, or half a cosine to zero.
         critic_learning_rate: Adam's.
         warm_start: share of the updates, the first ones, in which critics fit Monte-Carlo returns and the actor clones
-            the data, for algorithms that have both; from 1 on their number, of which all are the most.
+            the data, for algorithms that have both; from 1 on their number, at most all.
         actor_average: share of the actor that enters the averaged actor at each update; the average is what is saved.
     """
 

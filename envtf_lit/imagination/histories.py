@@ -37,6 +37,12 @@ class Histories:
         used, window = self.window[rollouts].unique(return_inverse=True)
         return Histories(self.observations[used], self.actions[used], self.lengths[rollouts], window)
 
+    @property
+    def present(self) -> Tensor:
+        """(B, S) the last observation of each."""
+        window = torch.arange(len(self), device=self.lengths.device) if self.window is None else self.window
+        return self.observations[window, self.lengths - 1]
+
     def to(self, device: torch.device | str) -> "Histories":
         """The same on another device."""
         columns = self.observations, self.actions, self.lengths, self.window

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 
 from envtf_lit.data.cards import markdown_table
 from envtf_lit.data.dataset import OfflineDataset
@@ -173,8 +172,7 @@ class CalibrationData:
         series = read_series(task.robot)
         self.starts, self.physics = pairs(held_out, options.rollouts, stream=1), Physics(task.robot)
         self.expert = load_snapshot(series, series.expert.steps).to(self.device)
-        seen = self.in_distribution.histories
-        real = seen.observations[torch.arange(len(seen)), seen.lengths - 1]
+        real = self.in_distribution.histories.present
         self.deepest = float(self.physics.depth(real.cpu().numpy()).max())
 
     def measure(self, model: WorldModel) -> Findings:
