@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import torch
 from analytic import linear_data, linear_world
-from matplotlib.colors import to_hex
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
@@ -174,8 +174,10 @@ def test_policies_keep_their_colour_from_figure_to_figure(figures: list[Figure],
     curves, strip = figures
     lines = [to_hex(line.get_color()) for line in curves.axes[0].get_lines()]
     faces = [np.asarray(found.get_facecolor()) for found in strip.axes[0].collections]
-    dots = [to_hex(tuple(map(float, face[0, :3]))) for face in faces if len(face)]  # error bars have no face
-    assert [dot for dot in dots if dot in lines] == lines and len(set(lines)) == len(LONG)
+    dots = [np.round(255 * face[0, :3]).tolist() for face in faces if len(face)]  # error bars have no face
+    assert dots[1:] == [np.round(255 * np.array(to_rgb(line))).tolist() for line in lines] and len(set(lines)) == len(
+        LONG
+    )
 
 
 def test_settings_of_matplotlib_survive(tmp_path):
