@@ -142,7 +142,7 @@ def read_run(root: str | Path, *, simulator: bool) -> Run:
     metrics, card = read_json(home / "reports/metrics.json"), read_json(home / "data/dataset.json")
     scores = pd.read_csv(home / "reports/plots/scores.csv")
     of_policies = scores[scores["kind"] == "policy"]
-    episodes = {str(name): group["score"].to_numpy() for name, group in of_policies.groupby("name", sort=False)}
+    episodes = {str(name): np.asarray(group["score"]) for name, group in of_policies.groupby("name", sort=False)}
     run = Run(home, metrics, card, episodes)
     if run.simulated != simulator:
         raise UserError(

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pandas as pd
 
 from envtf_lit.figures.report import Run
@@ -131,12 +132,13 @@ def about_origin(run: Run) -> str:
 def about_training(run: Run) -> str:
     """The world model's size, and the epoch whose weights were kept."""
     curves = pd.read_csv(run.world_model_folder / "curves.csv")
-    errors, epochs = curves["val/open_loop_error"].dropna(), curves["epoch"]
-    best = int(errors.to_numpy().argmin())
+    kept = curves["val/open_loop_error"].notna()
+    errors, epochs = (np.asarray(curves.loc[kept, name]) for name in ("val/open_loop_error", "epoch"))
+    best = int(errors.argmin())
     return _joined(
-        f"{run.metrics['world_model']['parameters']:,} parameters. The open-loop error was {errors.iloc[0]:.3g} after",
-        f"the first of {int(epochs.max())} epochs and {errors.min():.3g} at its least, after epoch",
-        f"{int(epochs[errors.index[best]])}, whose weights were kept.",
+        f"{run.metrics['world_model']['parameters']:,} parameters. The open-loop error was {errors[0]:.3g} after",
+        f"the first of {int(epochs[-1])} epochs and {errors[best]:.3g} at its least, after epoch {int(epochs[best])},",
+        "whose weights were kept.",
         "It was still falling at the end: longer training would help." if 0 < best == len(errors) - 1 else "",
     )
 
