@@ -114,7 +114,6 @@ def test_a_toy_is_evaluated(experiment: Path) -> None:
     assert {"score_mean", "score_std", "return_mean", "return_std"} < policies["toy"].keys()
 
 
-@pytest.mark.skip(reason="the notebook is being rewritten for policies of any name")
 def test_a_toy_is_reported(experiment: Path, repository: Path) -> None:
     pytest.importorskip("papermill")
     from tests.reports import said  # needs the extra `pipeline`, too
