@@ -1,6 +1,7 @@
 """What `envtf model …` and `envtf agent …` train, and what they read: the signatures are the command lines."""
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, Literal
 
 from envtf_lit.agents.agent import Agent
@@ -13,6 +14,7 @@ from envtf_lit.world_models.lit import LitWorldModel, lit_world_model
 from envtf_lit.world_models.options import KINDS
 
 
+@cache  # jsonargparse wants one function of a name
 def world_model_of(kind: str) -> Callable[..., LitWorldModel]:
     """The function whose signature is `envtf model`, for one kind of world model."""
     Options: Any = KINDS[kind]
@@ -42,9 +44,11 @@ def world_model_of(kind: str) -> Callable[..., LitWorldModel]:
         """
         return lit_world_model(observation_dim, action_dim, options, seed, init_from, freeze, compile)
 
+    world_model.__qualname__ = f"world_model_{kind}"
     return world_model
 
 
+@cache
 def agent_of(algorithm: str) -> Callable[..., Agent]:
     """The function whose signature is `envtf agent`, for one algorithm that learns from data alone."""
     cls = ALGORITHMS[algorithm]
@@ -87,6 +91,7 @@ def agent_of(algorithm: str) -> Callable[..., Agent]:
             freeze=freeze,
         )
 
+    agent.__qualname__ = f"agent_{algorithm}"
     return agent
 
 
