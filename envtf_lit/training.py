@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import logging
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -89,10 +88,8 @@ class WholeCheckpoints(TorchCheckpointIO):
             return
         buffer = io.BytesIO()
         torch.save(checkpoint, buffer)  # so that a full disk is an OSError
-        with replacing(path) as temporary, temporary.open("wb") as stream:
-            stream.write(buffer.getbuffer())
-            stream.flush()
-            os.fsync(stream.fileno())
+        with replacing(path) as temporary:
+            temporary.write_bytes(buffer.getbuffer())
 
 
 @contextlib.contextmanager

@@ -12,33 +12,33 @@ from torch.nn import functional as F
 
 from envtf_lit import load_world_model
 from envtf_lit.data.loaders import Resamples, Windows
+from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.train_model import train_model
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.lit import LitEnsemble
-from envtf_lit.world_models.options import EnsembleOptions, TrainModelOptions
+from envtf_lit.world_models.options import EnsembleOptions
 from envtf_lit.world_models.store import save_world_model
 from tests.test_training import Killed, bytes_of, kill_in_epoch
 from tests.walker import walker_dataset
 
 S, A = 5, 2
+OPTIONS = EnsembleOptions(
+    members=3,
+    elites=2,
+    hidden=(8, 8),
+    weight_decay=(1e-5, 1e-5, 1e-5),
+    updates=12,
+    updates_per_epoch=4,
+    batch_size=8,
+)
 TINY = Params(
     threads=1,
     precision="fp32",
-    train_model=TrainModelOptions(
-        held_out=0.2,
-        ensemble=EnsembleOptions(
-            members=3,
-            elites=2,
-            hidden=(8, 8),
-            weight_decay=(1e-5, 1e-5, 1e-5),
-            updates=12,
-            updates_per_epoch=4,
-            batch_size=8,
-        ),
-    ),
+    download=DownloadOptions(held_out=0.2),
+    train_model={"ensemble": OPTIONS},
 )
 
 
@@ -260,20 +260,18 @@ def root(tmp_path: Path) -> Path:
 
 def train(root: Path, params: Params = TINY) -> dict[str, bytes]:
     train_model(params, root, progress=False)
-    return bytes_of(root / "models/world_model")
+    return bytes_of(root / "models/world_model/ensemble")
 
 
 def with_options(**options) -> Params:
-    ensemble = TINY.train_model.ensemble
-    assert ensemble is not None
-    return replace(TINY, train_model=replace(TINY.train_model, ensemble=replace(ensemble, **options)))
+    return replace(TINY, train_model={"ensemble": replace(OPTIONS, **options)})
 
 
-def test_the_pipeline_trains_the_ensemble_where_its_section_stands(root):
+def test_the_pipeline_trains_the_ensemble_whose_section_is_of_that_kind(root):
     train(root, with_options(updates=60, updates_per_epoch=20, learning_rate=0.01))
-    model = load_world_model(root / "models/world_model")
+    model = load_world_model(root / "models/world_model/ensemble")
     assert isinstance(model, EnsembleDynamics) and model.limit != 1.0
-    with (root / "models/world_model/curves.csv").open() as stream:
+    with (root / "models/world_model/ensemble/curves.csv").open() as stream:
         losses = [float(row["train/loss"]) for row in csv.DictReader(stream)]
     assert len(losses) == 3 and losses[-1] < losses[0]
 
@@ -295,7 +293,7 @@ def test_training_stops_when_no_member_improves(root):
 
 def test_members_are_kept_at_their_best_and_the_best_are_elites():
     data = walker_dataset()
-    lit = LitEnsemble(data.observation_dim, data.action_dim, TINY.train_model)
+    lit = LitEnsemble(data.observation_dim, data.action_dim, OPTIONS)
     history = []
     for error in ([0.5, 0.3, 0.9], [0.6, 0.299, 0.2], [0.4, 0.1, 0.5]):
         for weight in lit.model.parameters():

@@ -10,19 +10,20 @@ import torch
 from analytic import linear_data, linear_world
 from reports import said
 
+from envtf_lit.agents.et_cql import ETCQLOptions
+from envtf_lit.agents.value_gradient import ValueGradientOptions
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.horizon import horizon_report
-from envtf_lit.evaluation.offline import action_error, imagined_returns, judge
-from envtf_lit.imagination.options import ImaginationOptions, ValueGradientOptions
+from envtf_lit.evaluation.offline import action_error, evaluate_offline, imagined_returns
+from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.pipeline.download import download
 from envtf_lit.pipeline.evaluate import evaluate
 from envtf_lit.pipeline.generate_rollouts import generate_rollouts
 from envtf_lit.pipeline.params import Params, check_rules
 from envtf_lit.pipeline.report import report
-from envtf_lit.pipeline.stage import ALGORITHMS
 from envtf_lit.pipeline.train_model import train_model
 from envtf_lit.pipeline.train_policy import train_policy
 from envtf_lit.pipeline.yaml import preset_params
@@ -75,12 +76,12 @@ def test_action_error_is_in_units_of_the_spread_of_the_actions():
     assert wide == pytest.approx(5.0, rel=1e-4)
 
 
-def test_a_perfect_model_promises_the_recorded_actions_their_true_return():
+def test_a_perfect_model_gives_the_recorded_actions_their_true_return():
     data, world = linear_data((20, 30)), linear_world()
     report = horizon_report(world, whole_episodes(data, 2, seed=0), Scale.of(data))
-    promises = judge(world, {"bc": Constant(0.0)}, report, data)
-    np.testing.assert_allclose(promises.promised, promises.recorded, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(sorted(promises.recorded), sorted(data.episode_returns), rtol=1e-5)
+    estimates = evaluate_offline(world, {"bc": Constant(0.0)}, report, data)
+    np.testing.assert_allclose(estimates.imagined, estimates.recorded, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(sorted(estimates.recorded), sorted(data.episode_returns), rtol=1e-5)
 
 
 # the pipeline
@@ -115,19 +116,21 @@ def own_log(episodes: int = 12, length: int = 25) -> OfflineDataset:
 
 def own_params(path: Path) -> Params:
     tiny = preset_params("tiny")
-    climbing = ValueGradientOptions(updates=5, rollouts=5, horizon=3)
-    imagination = ImaginationOptions(
-        refresh_every=20, branches=20, horizon=2, tail=2, history=2, buffer_size=200, value_gradient=climbing
+    policies = {name: replace(options, updates=40, updates_per_epoch=20) for name, options in tiny.train_policy.items()}
+    assert isinstance(policies["et_cql"], ETCQLOptions)
+    policies["et_cql"] = replace(
+        policies["et_cql"],
+        refresh_every=20,
+        rollouts=RolloutOptions(branches=20, horizon=2, value_expansion=2, history=2),
+        value_gradient=ValueGradientOptions(updates=5, rollouts=5, horizon=3),
     )
-    policy = replace(tiny.train_policy.et_cql, updates=40, updates_per_epoch=20, imagination=imagination)
     return replace(
         tiny,
         task=None,
         threads=1,
         download=DownloadOptions(source="file", path=str(path), held_out=0.25),
-        train_model=replace(tiny.train_model, updates=60, updates_per_epoch=30, held_out=0.25),
-        generate_rollouts=replace(tiny.generate_rollouts, clone_updates=100, branches=30),
-        train_policy=replace(tiny.train_policy, cql=replace(policy, imagination=None), et_cql=policy),
+        generate_rollouts=replace(tiny.generate_rollouts, branches=30),
+        train_policy=policies,
     )
 
 
@@ -140,9 +143,10 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Params]:
     check_rules(params)
     download(params, root, progress=False)
     train_model(params, root, progress=False)
+    train_policy(params, root, name="bc", progress=False)
     generate_rollouts(params, root, progress=False)
-    for algorithm in ALGORITHMS:
-        train_policy(params, root, algorithm=algorithm, progress=False)
+    for name in ("cql", "et_cql"):
+        train_policy(params, root, name=name, progress=False)
     evaluate(params, root, progress=False)
     return root, params
 
@@ -152,10 +156,11 @@ def test_metrics_hold_no_score_and_only_finite_numbers(finished: tuple[Path, Par
     metrics = json.loads((root / "reports/metrics.json").read_text(), parse_constant=pytest.fail)
     assert metrics["task"] is None
     assert "score" not in json.dumps(metrics)
-    assert set(metrics["policy"]) == {"imagined_return_mean", "imagined_return_std", "action_error"}
-    assert set(metrics["baselines"]) == {"bc", "cql"}
+    assert set(metrics["policies"]) == {"bc", "cql", "et_cql"}
+    names = {"label", "imagined_return_mean", "imagined_return_std", "action_error"}
+    assert all(set(policy) == names for policy in metrics["policies"].values())
     assert metrics["held_out"]["episodes"] == 2  # of the three held out, one scales the predicted intervals
-    assert metrics["baselines"]["bc"]["action_error"] > 0
+    assert metrics["policies"]["bc"]["action_error"] > 0
     assert metrics["world_model"]["termination"] == "learned"
     card = json.loads((root / "data/dataset.json").read_text())
     assert card["task"] is None and "scores" not in card
@@ -168,8 +173,8 @@ def test_policies_never_saw_the_held_out_episodes_and_act_in_the_files_own_range
     dataset = load_dataset(root / "data/dataset.h5")
     training, held_out = dataset.split()
     assert len(held_out.episode_starts) == 3
-    for folder in ("behaviour", "policy/cql", "policy/et_cql"):
-        policy = load_policy(root / "models" / folder)
+    for name in ("bc", "cql", "et_cql"):
+        policy = load_policy(root / "models/policy" / name)
         mean, _ = training.observation_scale()
         torch.testing.assert_close(policy.observation_mean, mean)
         assert policy.action_low.tolist() == [-2, -2]

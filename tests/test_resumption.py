@@ -2,7 +2,6 @@
 
 import errno
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +13,18 @@ from envtf_lit.errors import UserError
 from envtf_lit.pipeline.generate_rollouts import generate_rollouts
 from envtf_lit.pipeline.train_model import train_model
 from envtf_lit.pipeline.train_policy import train_policy
-from envtf_lit.training import WholeCheckpoints
+from envtf_lit.training import WholeCheckpoints, trained
+from envtf_lit.world_models.lit import lit_world_model, window_data
 from envtf_lit.world_models.options import EnsembleOptions
 from tests.test_training import (
-    IMAGINATION,
-    POLICY,
+    MODEL,
     TINY,
     Idle,
     Killed,
     bytes_of,
     kill_in_epoch,
     killed,
-    train_both,
+    train_whole,
     train_with,
 )
 from tests.walker import walker_dataset
@@ -40,63 +39,66 @@ def root(tmp_path: Path) -> Path:
 ENSEMBLE = EnsembleOptions(
     members=3, elites=2, hidden=(8,), weight_decay=(0.0, 0.0), updates=40, updates_per_epoch=4, patience=1
 )
-SELECTED = replace(POLICY, imagination=replace(IMAGINATION, selection_episodes=2, selection_steps=5))
-# stage, parameters, what it writes, the files it keeps until that is done, and where it is killed
+ENSEMBLES = replace(TINY, train_model={"ensemble": ENSEMBLE})
+# stage, parameters, section, what it writes, the files it keeps until that is done, and where it is killed
 GAPS = {
-    "model": ("train_model", TINY, "models/world_model", {"best.ckpt", "last.ckpt"}, "world_models.fit.replacing"),
-    "ensemble": (
-        "train_model",
-        replace(TINY, train_model=replace(TINY.train_model, ensemble=ENSEMBLE)),
-        "models/world_model",
-        {"last.ckpt"},
-        "world_models.fit.replacing",
-    ),
+    "model": ("model", TINY, "transformer", {"best.ckpt", "last.ckpt"}, "world_models.fit.replacing"),
+    "ensemble": ("model", ENSEMBLES, "ensemble", {"last.ckpt"}, "world_models.fit.replacing"),
     "uncertainty": (
-        "train_model",
+        "model",
         TINY,
-        "models/world_model",
+        "transformer",
         {"best.ckpt", "last.ckpt"},
         "world_models.lit.LitWorldModel.fit_uncertainty",
     ),
-    "clone": ("generate_rollouts", TINY, "models/behaviour", {"last.ckpt"}, "pipeline.generate_rollouts.replacing"),
-    "rollouts": (
-        "generate_rollouts",
-        TINY,
-        "models/behaviour",
-        {"last.ckpt"},
-        "pipeline.generate_rollouts.save_rollouts",
-    ),
-    "policy": (
-        "train_policy",
-        replace(TINY, train_policy=replace(TINY.train_policy, et_cql=SELECTED)),
-        "models/policy/et_cql",
-        {"best.ckpt", "last.ckpt"},
-        "agents.store.replacing",
-    ),
+    "clone": ("policy", TINY, "bc", {"last.ckpt"}, "agents.store.replacing"),
+    "policy": ("policy", TINY, "et_cql", {"last.ckpt"}, "agents.store.replacing"),
 }
 
 
 @pytest.mark.parametrize("gap", GAPS)
 def test_a_kill_between_training_and_publication_loses_no_training(root, monkeypatch, gap):
-    name, params, target, kept, place = GAPS[gap]
-    if name != "train_model":
+    kind, params, name, kept, place = GAPS[gap]
+    if name == "et_cql":
         train_model(TINY, root, progress=False)
-    if name == "train_policy":
+        train_policy(TINY, root, name="bc", progress=False)
         generate_rollouts(TINY, root, progress=False)
-    stage = getattr(import_module(f"envtf_lit.pipeline.{name}"), name)
-    metrics = stage(params, root, progress=False)
+    stage, target = (
+        (train_model, f"models/world_model/{name}") if kind == "model" else (train_policy, f"models/policy/{name}")
+    )
+    metrics = stage(params, root, name=name, progress=False)
     expected = bytes_of(root / target)
     assert list((root / ".envtf/runs").iterdir()) == []
     with monkeypatch.context() as patch:
         patch.setattr(f"envtf_lit.{place}", killed)
         with pytest.raises(Killed):
-            stage(params, root, progress=False)
+            stage(params, root, name=name, progress=False)
     (run,) = (root / ".envtf/runs").iterdir()
     assert {path.name for path in run.iterdir()} == kept
     with monkeypatch.context() as patch:
         train_with(patch, Idle())
-        assert stage(params, root, progress=False) == metrics
+        assert stage(params, root, name=name, progress=False) == metrics
     assert bytes_of(root / target) == expected and not run.exists()
+
+
+def test_what_was_trained_is_there_until_the_block_that_publishes_has_succeeded(root, monkeypatch):
+    data = window_data(str(root / "data/dataset.h5"), MODEL, held_out=0.2, seed=0)
+
+    def train(seed: int) -> Any:
+        lit = lit_world_model(data.observation_dim, data.action_dim, MODEL, seed=seed)
+        options: dict[str, Any] = dict(epochs=3, precision="fp32", progress=False, monitor=lit.monitor)
+        return lit, trained(lit, data, run=root / "run", target=root / "there", **options)
+
+    lit, training = train(0)
+    with pytest.raises(Killed), training as curves:
+        raise Killed
+    assert (root / "run/last.ckpt").exists() and not (root / "there").exists()
+    train_with(monkeypatch, Idle())
+    other, training = train(1)
+    with training as again:
+        assert again.rows == curves.rows and len(curves.rows) == 3
+    assert all(torch.equal(a, b) for a, b in zip(lit.parameters(), other.parameters(), strict=True))
+    assert not (root / "run").exists()
 
 
 def folder_is_a_file(target: Path) -> str:
@@ -116,15 +118,14 @@ def dangling_link(target: Path) -> str:
 
 
 @pytest.mark.parametrize("obstacle", [folder_is_a_file, parent_is_a_file, dangling_link])
-@pytest.mark.parametrize("target", ["models/world_model", "models/policy/cql", "models/behaviour"])
+@pytest.mark.parametrize("target", ["models/world_model/transformer", "models/policy/cql"])
 def test_a_target_that_cannot_be_written_is_refused_before_training(root, monkeypatch, obstacle, target):
     (root / target).parent.mkdir(parents=True)
     said = obstacle(root / target)
     train_with(monkeypatch, Idle())
     train = {
-        "models/world_model": lambda: train_model(TINY, root, progress=False),
-        "models/policy/cql": lambda: train_policy(TINY, root, algorithm="cql", progress=False),
-        "models/behaviour": lambda: generate_rollouts(TINY, root, progress=False),
+        "models/world_model/transformer": lambda: train_model(TINY, root, progress=False),
+        "models/policy/cql": lambda: train_policy(TINY, root, name="cql", progress=False),
     }[target]
     with pytest.raises(UserError, match=said):
         train()
@@ -146,10 +147,10 @@ def test_a_read_only_folder_is_refused_before_training(root, monkeypatch, closed
         train_model(TINY, root, progress=False)
 
 
-def test_rollouts_that_cannot_be_written_are_refused_before_the_clone_is_trained(root, monkeypatch):
-    (root / "data/rollouts.h5").mkdir()
-    train_with(monkeypatch, Idle())
-    with pytest.raises(UserError, match=r"rollouts\.h5: a folder of that name stands there"):
+def test_rollouts_that_cannot_be_written_are_refused_before_any_is_imagined(root, monkeypatch):
+    (root / "data/rollouts/transformer.h5").mkdir(parents=True)
+    monkeypatch.setattr("envtf_lit.pipeline.generate_rollouts.imagine", killed)
+    with pytest.raises(UserError, match=r"transformer\.h5: a folder of that name stands there"):
         generate_rollouts(TINY, root, progress=False)
 
 
@@ -177,29 +178,29 @@ DAMAGES = [(name, damage) for damage in (torn, empty, never_written, another_fil
 
 @pytest.mark.parametrize(("name", "damage"), [*DAMAGES, ("best", Path.unlink)])
 def test_a_damaged_checkpoint_is_set_aside_and_training_starts_anew(root, monkeypatch, capsys, name, damage):
-    expected = train_both(root)
+    expected = train_whole(root)
     with monkeypatch.context() as patch:
         kill_in_epoch(patch, 2)
         with pytest.raises(Killed):
-            train_both(root)
+            train_whole(root)
     (run,) = (root / ".envtf/runs").iterdir()
     damage(run / f"{name}.ckpt")
     capsys.readouterr()
     with monkeypatch.context() as patch:
         kill_in_epoch(patch, 0)
         with pytest.raises(Killed):
-            train_both(root)
+            train_whole(root)
     aside = {"last.ckpt.unreadable", "best.ckpt.unreadable"} - (
         {"best.ckpt.unreadable"} if damage is Path.unlink else set()
     )
     assert {path.name for path in run.iterdir()} == aside
-    assert train_both(root) == expected and not run.exists()
+    assert train_whole(root) == expected and not run.exists()
     (sentence,) = capsys.readouterr().err.strip().splitlines()
     assert f"{name}.ckpt is damaged or missing" in sentence and "training starts anew" in sentence
 
 
 def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(root, monkeypatch):
-    expected = train_both(root)
+    expected = train_whole(root)
     synced: list[int] = []
 
     def sync(file: int) -> None:
@@ -208,18 +209,18 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(root, monkey
             raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr("envtf_lit.training.os.fsync", sync)
+        patch.setattr("envtf_lit.files.os.fsync", sync)
         with pytest.raises(Killed):
-            train_both(root)
+            train_whole(root)
     (run,) = (root / ".envtf/runs").iterdir()
     assert torch.load(run / "last.ckpt", weights_only=True)["epoch"] == 0
     (run / ".last.ckpt.0123abcd.partial").write_bytes(b"what a killed process leaves")
     with monkeypatch.context() as patch:
         patch.setattr("envtf_lit.world_models.fit.replacing", killed)
         with pytest.raises(Killed):
-            train_both(root)
+            train_whole(root)
     assert {path.name for path in run.iterdir()} == {"best.ckpt", "last.ckpt"}
-    assert train_both(root) == expected
+    assert train_whole(root) == expected
 
 
 def test_a_full_disk_leaves_the_checkpoint_before_and_a_sentence(tmp_path, monkeypatch):
@@ -229,7 +230,7 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_a_sentence(tmp_path, monke
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("envtf_lit.training.os.fsync", full)
+    monkeypatch.setattr("envtf_lit.files.os.fsync", full)
     with pytest.raises(UserError, match=r"No space left while writing .*last\.ckpt"):
         WholeCheckpoints().save_checkpoint({"epoch": 1}, str(path))
     assert torch.load(path, weights_only=True) == {"epoch": 0} and list(tmp_path.iterdir()) == [path]

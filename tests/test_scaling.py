@@ -16,8 +16,8 @@ from envtf_lit.cli.main import main
 from envtf_lit.data.sources.files import save_dataset
 from tests.walker import walker_dataset
 
-MODEL = ["model.layers=1", "model.heads=2", "model.width=16", "model.context=4", "updates_per_epoch=3", "updates=6"]
-AGENT = ["hidden=[8]", "updates_per_step=2", "warm_start=2", "updates_per_epoch=4", "updates=8"]
+MODEL = ["layers=1", "heads=2", "width=16", "context=4", "updates_per_epoch=3", "updates=6"]
+AGENT = ["hidden=[8]", "warm_start=0.25", "updates_per_epoch=20", "updates=40"]
 
 
 def fit(folder: Path, kind: str, *flags: str) -> tuple[pd.DataFrame, dict]:

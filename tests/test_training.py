@@ -5,62 +5,52 @@ import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.bc import BCOptions
+from envtf_lit.agents.cql import CQLOptions
+from envtf_lit.agents.et_cql import ETCQLOptions
+from envtf_lit.agents.value_gradient import ValueGradientOptions
+from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.files import save_dataset
-from envtf_lit.imagination.options import ImaginationOptions, ValueGradientOptions
+from envtf_lit.imagination.options import GenerateRolloutsOptions, RolloutOptions
 from envtf_lit.modules import load_weights
 from envtf_lit.pipeline.generate_rollouts import generate_rollouts
 from envtf_lit.pipeline.params import Params
-from envtf_lit.pipeline.stage import WORLD_MODEL
 from envtf_lit.pipeline.train_model import train_model
 from envtf_lit.pipeline.train_policy import train_policy
 from envtf_lit.pipeline.yaml import params_yaml, preset_params
 from envtf_lit.training import run_folder, trained
 from envtf_lit.world_models.forecast import Scale, open_loop_error, segments
 from envtf_lit.world_models.lit import SELECTION_HORIZON, SELECTION_SEGMENTS, lit_world_model, window_data
-from envtf_lit.world_models.options import ModelOptions, TrainModelOptions
+from envtf_lit.world_models.options import TransformerOptions
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.walker import walker_dataset
 
+MODEL = TransformerOptions(
+    layers=1, heads=2, width=16, context=6, dropout=0.1, updates=12, updates_per_epoch=4, batch_size=8
+)
+SIZES: dict[str, Any] = dict(updates=40, updates_per_epoch=10, batch_size=16, hidden=(16, 16), warm_start=0.25)
+ET_CQL = ETCQLOptions(
+    **SIZES,
+    refresh_every=4,
+    rollouts=RolloutOptions(branches=20, horizon=2, value_expansion=2, history=2),
+    value_gradient=ValueGradientOptions(updates=15, rollouts=5, horizon=3),
+)
 TINY = Params(
     threads=1,
-    train_model=TrainModelOptions(
-        model=ModelOptions(layers=1, heads=2, width=16, context=6, dropout=0.1),
-        updates=12,
-        updates_per_epoch=4,
-        batch_size=8,
-        held_out=0.2,
-    ),
+    download=DownloadOptions(held_out=0.2),
+    train_model={"transformer": MODEL},
+    generate_rollouts=GenerateRolloutsOptions(branches=30, horizon=3),
+    train_policy={"bc": BCOptions(**SIZES), "cql": CQLOptions(**SIZES), "et_cql": ET_CQL},
 )
-IMAGINATION = ImaginationOptions(
-    refresh_every=2,
-    branches=20,
-    horizon=2,
-    history=2,
-    buffer_size=100,
-    value_gradient=ValueGradientOptions(updates=6, rollouts=5, horizon=3),
-)
-POLICY = PolicyOptions(
-    updates=12,
-    updates_per_epoch=4,
-    updates_per_step=2,
-    batch_size=16,
-    hidden=(16, 16),
-    warm_start=4,
-    imagination=IMAGINATION,
-)
-TINY = replace(
-    TINY,
-    generate_rollouts=replace(TINY.generate_rollouts, clone_updates=100, clone_batch_size=16, branches=30),
-    train_policy=replace(TINY.train_policy, cql=replace(POLICY, imagination=None), et_cql=POLICY),
-)
+WORLD_MODEL = Path("models/world_model/transformer")
 
 
 class Killed(Exception):
@@ -122,20 +112,20 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in sorted(folder.iterdir())}
 
 
-def train_both(root: Path, params: Params = TINY) -> dict[str, bytes]:
+def train_whole(root: Path, params: Params = TINY) -> dict[str, bytes]:
     train_model(params, root, progress=False)
-    return bytes_of(root / "models/world_model")
+    return bytes_of(root / WORLD_MODEL)
 
 
 def test_a_killed_model_run_resumes_to_the_same_bits(root, monkeypatch):
-    expected = train_both(root)
+    expected = train_whole(root)
     with monkeypatch.context() as patch:
         kill_in_epoch(patch, 2)
         with pytest.raises(Killed):
-            train_both(root)
+            train_whole(root)
     (run,) = (root / ".envtf/runs").iterdir()
     assert torch.load(run / "last.ckpt", weights_only=True)["epoch"] == 1
-    assert train_both(root) == expected
+    assert train_whole(root) == expected
     assert not run.exists()
 
 
@@ -143,32 +133,49 @@ def test_a_kill_followed_by_another_parameter_trains_afresh(root, monkeypatch):
     with monkeypatch.context() as patch:
         kill_in_epoch(patch, 2)
         with pytest.raises(Killed):
-            train_both(root)
+            train_whole(root)
     changed = replace(TINY, seed=1)
-    after_kill = train_both(root, changed)
-    assert after_kill == train_both(root, changed)
+    after_kill = train_whole(root, changed)
+    assert after_kill == train_whole(root, changed)
 
 
 def test_the_kept_model_is_the_one_of_least_open_loop_error(root):
     metrics = train_model(TINY, root, progress=False)
-    with (root / "models/world_model/curves.csv").open() as stream:
+    with (root / WORLD_MODEL / "curves.csv").open() as stream:
         errors = [float(row["val/open_loop_error"]) for row in csv.DictReader(stream)]
     assert len(errors) == 3 and metrics["open_loop_error"] == min(errors)
 
 
-@pytest.mark.parametrize("algorithm", ["cql", "et_cql"])
-def test_a_killed_policy_run_resumes_to_the_same_bits(root, monkeypatch, algorithm):
+@pytest.fixture(scope="module")
+def imagined(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project that has all that policies are trained from."""
+    root = tmp_path_factory.mktemp("imagined")
+    save_dataset(walker_dataset(), root / "data/dataset.h5")
     train_model(TINY, root, progress=False)
+    train_policy(TINY, root, name="bc", progress=False)
     generate_rollouts(TINY, root, progress=False)
-    train = lambda: train_policy(TINY, root, algorithm=algorithm, progress=False)  # noqa: E731
+    return root
+
+
+@pytest.mark.parametrize(
+    ("name", "epoch"),
+    [("bc", 2), ("cql", 2), ("et_cql", 1), ("et_cql", 2), ("et_cql", 3)],  # after warm start, amid CQL, amid the rest
+)
+def test_a_killed_policy_run_resumes_to_the_same_bits(imagined, monkeypatch, name, epoch):
+    train = lambda: train_policy(TINY, imagined, name=name, progress=False)  # noqa: E731
     train()
-    expected = bytes_of(root / "models/policy" / algorithm)
+    expected = bytes_of(imagined / "models/policy" / name)
     with monkeypatch.context() as patch:
-        kill_in_epoch(patch, 2)
+        kill_in_epoch(patch, epoch)
         with pytest.raises(Killed):
             train()
+    (run,) = (imagined / ".envtf/runs").iterdir()
+    saved = torch.load(run / "last.ckpt", weights_only=True)
+    assert saved["epoch"] == epoch - 1
+    if name == "et_cql":
+        assert saved["state_dict"]["source.ring.count"] > 0
     train()
-    assert bytes_of(root / "models/policy" / algorithm) == expected
+    assert bytes_of(imagined / "models/policy" / name) == expected
 
 
 def test_compiled_training_learns_what_plain_training_learns(root, monkeypatch):
@@ -179,9 +186,9 @@ def test_compiled_training_learns_what_plain_training_learns(root, monkeypatch):
         return original(function, backend="eager")
 
     monkeypatch.setattr(torch, "compile", through_dynamo)
-    options = replace(TINY.train_model, model=replace(TINY.train_model.model, dropout=0.0))
+    options = replace(MODEL, dropout=0.0)
     for compile in (False, True):
-        params = replace(TINY, precision="fp32", compile=compile, train_model=options)
+        params = replace(TINY, precision="fp32", compile=compile, train_model={"transformer": options})
         train_model(params, root, progress=False)
         weights.append(load_world_model(root / WORLD_MODEL).state_dict())
     assert len(compiled) == 1
@@ -190,9 +197,8 @@ def test_compiled_training_learns_what_plain_training_learns(root, monkeypatch):
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_gradients_are_clipped_before_a_step_in_one_pass(root, precision):
-    options = TINY.train_model
-    data = window_data(str(root / "data/dataset.h5"), options, seed=0)
-    lit = lit_world_model(data.observation_dim, data.action_dim, options)
+    data = window_data(str(root / "data/dataset.h5"), MODEL, held_out=0.2, seed=0)
+    lit = lit_world_model(data.observation_dim, data.action_dim, MODEL)
     norms = Norms()
     with trained(
         lit,
@@ -206,15 +212,15 @@ def test_gradients_are_clipped_before_a_step_in_one_pass(root, precision):
         callbacks=[norms],
     ):
         pass
-    assert norms.seen == pytest.approx([1e-3] * options.updates_per_epoch, rel=1e-2)
+    assert norms.seen == pytest.approx([1e-3] * MODEL.updates_per_epoch, rel=1e-2)
     assert lit.configure_optimizers()["optimizer"].defaults["fused"]
 
 
 def test_gradient_steps_are_those_asked_for(root):
-    train_policy(TINY, root, algorithm="cql", progress=False)
+    train_policy(TINY, root, name="cql", progress=False)
     with (root / "models/policy/cql/curves.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert [row["epoch"] for row in rows] == ["1", "2", "3"]
+    assert [row["epoch"] for row in rows] == ["1", "2", "3", "4"]
     assert rows[0]["train/clone_loss"] and not rows[0]["train/bellman_loss"]  # the warm start is the first epoch
     assert rows[2]["train/bellman_loss"]
 
@@ -231,9 +237,9 @@ def test_run_folders_differ_by_parameters_and_by_bytes(tmp_path):
 
 def test_the_training_metric_is_what_the_saved_model_scores(root):
     metrics = train_model(TINY, root, progress=False)
-    training, held_out = walker_dataset().split(TINY.train_model.held_out, seed=TINY.seed)
+    training, held_out = walker_dataset().split(TINY.download.held_out, seed=TINY.seed)
     stretches = segments(held_out, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=TINY.seed)
-    error = open_loop_error(load_world_model(root / "models/world_model"), stretches, Scale.of(training))
+    error = open_loop_error(load_world_model(root / WORLD_MODEL), stretches, Scale.of(training))
     assert error == pytest.approx(metrics["open_loop_error"], rel=1e-5)
 
 
@@ -242,7 +248,7 @@ def test_two_processes_with_one_seed_write_the_same_bytes(tmp_path):
     for name in ("one", "two"):
         save_dataset(walker_dataset(), tmp_path / name / "data/dataset.h5")
         (tmp_path / name / "params.yaml").write_text(params_yaml(TINY))
-        for stage in (["train_model"], ["generate_rollouts"], ["train_policy", "et_cql"]):
+        for stage in (["train_model"], ["train_policy", "bc"], ["generate_rollouts"], ["train_policy", "et_cql"]):
             subprocess.run([sys.executable, "-m", "envtf_lit", *stage, "--quiet"], cwd=tmp_path / name, check=True)
         written = [p for p in sorted((tmp_path / name).rglob("*")) if p.is_file() and ".envtf" not in p.parts]
         outputs.append({str(p.relative_to(tmp_path / name)): p.read_bytes() for p in written})
@@ -251,10 +257,11 @@ def test_two_processes_with_one_seed_write_the_same_bytes(tmp_path):
 
 @pytest.mark.slow
 def test_the_papers_model_learns_a_step():
-    options = preset_params("paper").train_model
+    options = preset_params("paper").train_model["transformer"]
+    assert isinstance(options, TransformerOptions)
     model = EnvironmentTransformer(27, 8, **asdict(options.model))
     assert 95e6 < sum(p.numel() for p in model.parameters()) < 105e6
-    B, T = options.batch_size, options.model.context
+    B, T = options.batch_size, options.context
     batch = dict(
         observations=torch.randn(B, T, 27),
         actions=torch.randn(B, T, 8),
@@ -270,9 +277,9 @@ def test_the_papers_model_learns_a_step():
 
 
 def test_saved_models_come_back_whole(root):
-    train_both(root)
-    model = load_world_model(root / "models/world_model")
-    again = load_world_model(root / "models/world_model")
-    load_weights(again, root / "models/world_model/weights.safetensors")
+    train_whole(root)
+    model = load_world_model(root / WORLD_MODEL)
+    again = load_world_model(root / WORLD_MODEL)
+    load_weights(again, root / WORLD_MODEL / "weights.safetensors")
     assert not model.training
     assert all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), again.state_dict().values(), strict=True))

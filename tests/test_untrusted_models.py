@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 import torch
 
-from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.cql import CQLOptions
 from envtf_lit.cli.main import main
 from envtf_lit.cli.saved_options import checkpoint_options, model_architecture, policy_architecture
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.world_models.options import TrainModelOptions
+from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions
 from tests.walker import walker_dataset
 
 CANARY = "from pathlib import Path\nPath({ran!r}).touch()\nclass Trap:\n    pass\n"
@@ -30,9 +30,9 @@ INJECTIONS: dict[str, Any] = {
     "key that names a file": {"__path__": "evil.yaml"},
 }
 SIZES = {
-    "model": {"model.layers": 1, "model.heads": 2, "model.width": 16, "model.context": 4, "batch_size": 8},
-    "ensemble": {"ensemble.members": 2, "ensemble.elites": 1, "ensemble.hidden": [8], "ensemble.weight_decay": [0, 0]},
-    "agent": {"hidden": [8], "updates_per_step": 2, "warm_start": 2, "batch_size": 8},
+    "model": {"layers": 1, "heads": 2, "width": 16, "context": 4, "batch_size": 8},
+    "ensemble": {"members": 2, "elites": 1, "hidden": [8], "weight_decay": [0, 0]},
+    "agent": {"hidden": [8], "batch_size": 8},
 }
 QUIET = ["--trainer.logger=false", "--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
 FOLDERS = {
@@ -42,12 +42,16 @@ FOLDERS = {
 }
 CHECKPOINTS = {
     "model": [
-        *("", "options", "seed", "freeze", "freeze.0", "options.model", "options.ensemble", "options.updates"),
-        *("options.model.width", "options.model.activation", "options.class_path", "options.model.class_path"),
+        *("", "options", "seed", "freeze", "freeze.0", "options.updates"),
+        *("options.width", "options.activation", "options.class_path"),
     ],
-    "ensemble": ["options.ensemble.hidden", "options.ensemble.hidden.0", "options.ensemble.class_path"],
-    "agent": ["options", "options.hidden.0", "options.imagination", "options.actor_schedule", "seed", "freeze.0"],
+    "ensemble": ["options.hidden", "options.hidden.0", "options.class_path"],
+    "agent": [
+        *("options", "options.hidden.0", "options.return_temperature", "options.actor_schedule"),
+        *("options.world_model", "options.rollouts", "seed", "freeze.0"),
+    ],
 }
+OPTIONS = {"model": TransformerOptions, "ensemble": EnsembleOptions, "agent": CQLOptions}
 
 # Lightning 2.6's use of an older jsonargparse's names
 pytestmark = pytest.mark.filterwarnings("ignore::jsonargparse._deprecated.JsonargparseDeprecationWarning")
@@ -59,12 +63,13 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("sound")
     save_dataset(walker_dataset(), root / "dataset.h5")
     for kind, sizes in SIZES.items():
-        budget = "ensemble." if kind == "ensemble" else ""
-        options = sizes | {f"{budget}updates": 2, f"{budget}updates_per_epoch": 2}
+        updates = 10 if kind == "agent" else 2
+        options = sizes | {"updates": updates, "updates_per_epoch": updates}
         named = [f"--model.options.{name}={value}" for name, value in options.items()]
         part = {"model": "norm", "ensemble": "biases.0", "agent": "net.2"}[kind]
         run = [f"--trainer.default_root_dir={root / kind}", f"--model.freeze=[{part}]", *QUIET]
-        main([command(kind), "fit", f"--data.path={root / 'dataset.h5'}", *named, *run])
+        chosen = ["--model.kind=ensemble"] if kind == "ensemble" else []
+        main([command(kind), "fit", f"--data.path={root / 'dataset.h5'}", *chosen, *named, *run])
     return root
 
 
@@ -158,12 +163,15 @@ def test_a_published_folders_options_are_of_our_schema(kind: str, position: str,
 
 @pytest.mark.parametrize(("kind", "position"), of(CHECKPOINTS))
 def test_a_checkpoints_options_are_of_our_schema(kind: str, position: str, sound: Path, ran: Path) -> None:
-    options = PolicyOptions if kind == "agent" else TrainModelOptions
+    options = OPTIONS[kind]
     assert checkpoint_options(sound_checkpoint(sound, kind), options)["seed"] == 0
     for injection in INJECTIONS.values():
         checkpoint = changed_checkpoint(sound, kind, position, injection)
         if position == "freeze.0" and injection in ("canary.Trap", "evil.yaml"):  # such a text may well name a part
             assert checkpoint_options(checkpoint, options)["freeze"] == [injection]
+            continue
+        if position == "options.world_model" and isinstance(injection, str):  # a name, which the command refuses
+            assert checkpoint_options(checkpoint, options)["options"]["world_model"] == injection
             continue
         with pytest.raises(UserError, match=r"changed\.ckpt is not a checkpoint of this model"):
             checkpoint_options(checkpoint, options)
@@ -191,15 +199,24 @@ def test_a_checkpoint_runs_nothing(
 
 
 @pytest.mark.parametrize("injection", INJECTIONS)
-@pytest.mark.parametrize("position", ["arguments.width", "options.ensemble", "freeze.0"])
+@pytest.mark.parametrize(
+    ("kind", "position"),
+    [
+        ("model", "arguments.width"),
+        ("model", "options.width"),
+        ("model", "freeze.0"),
+        ("ensemble", "options.hidden"),
+        ("agent", "options.world_model"),
+    ],
+)
 def test_no_injection_runs(
-    position: str, injection: str, sound: Path, ran: Path, capsys: pytest.CaptureFixture[str]
+    kind: str, position: str, injection: str, sound: Path, ran: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if position == "arguments.width":
-        flag = f"--model.init_from={changed_folder(sound, 'model', position, INJECTIONS[injection])}"
+    if position.startswith("arguments"):
+        flag = f"--model.init_from={changed_folder(sound, kind, position, INJECTIONS[injection])}"
     else:
-        flag = f"--ckpt_path={changed_checkpoint(sound, 'model', position, INJECTIONS[injection])}"
-    check_refused(capsys, ran, "model", sound, flag)
+        flag = f"--ckpt_path={changed_checkpoint(sound, kind, position, INJECTIONS[injection])}"
+    check_refused(capsys, ran, kind, sound, flag)
 
 
 class Reduces:

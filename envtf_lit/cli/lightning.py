@@ -4,28 +4,31 @@ import json
 import re
 import warnings
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import lightning as L
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
+from envtf_lit.agents.options import NO_WORLD_MODEL
 from envtf_lit.agents.registry import ALGORITHMS
+from envtf_lit.cli.arguments import SHIPPED, given, with_shipped_configs
 from envtf_lit.cli.components import LogTransitions, LogWindows, agent_of, world_model_of
 from envtf_lit.cli.publish import KeepConfig, Publish
-from envtf_lit.cli.saved_options import checkpoint_options, model_architecture, policy_architecture
+from envtf_lit.cli.saved_options import (
+    checkpoint_class,
+    checkpoint_options,
+    model_architecture,
+    model_kind,
+    policy_architecture,
+)
 from envtf_lit.data.loaders import UPDATES_PER_STEP
+from envtf_lit.data.options import DownloadOptions
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.options.schema import build
 from envtf_lit.pipeline.params import Params
 from envtf_lit.training import Curves, WholeCheckpoints
 from envtf_lit.world_models.options import KINDS, TransformerOptions
-
-CONFIGS = Path(__file__).parent.parent / "configs"
-SHIPPED = ", ".join(sorted(path.stem for path in CONFIGS.glob("*.yaml")))
 
 TRUST = (
     "A --config file is trusted like code: it may name any class to run, so take one only from where you would take a "
@@ -47,14 +50,16 @@ class _LinkedCLI(LightningCLI):
 
     from_data: tuple[str, ...] = ("observation_dim", "action_dim")
     links: dict[str, str]
-    options: type[Any]  # the options class of the kind or algorithm that was chosen
+    tag: str  # the option of the model on which the others depend
+    chosen: str  # its value
+    options: type[Any]  # the options class that goes with it
     verbs: tuple[str, ...]
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         for name in self.from_data:
             parser.link_arguments(f"data.{name}", f"model.{name}", apply_on="instantiate")
         for source, target in self.links.items():
-            parser.link_arguments(source, target)
+            parser.link_arguments(source, target, compute_fn=_plain)
         self.link_more(parser)
 
     def link_more(self, parser: LightningArgumentParser) -> None:
@@ -96,23 +101,39 @@ class _LinkedCLI(LightningCLI):
         """The options that a published folder's weights ask for."""
         raise NotImplementedError
 
+    @staticmethod
+    def check(options: Any, held_out: float) -> None:
+        """What is a rule for this command alone.
+
+        Raises:
+            UserError: it is broken.
+        """
+        raise NotImplementedError
+
     def _parse_ckpt_path(self) -> None:
         """Lightning would let the checkpoint's options win over flags; see `parse_arguments`."""
 
     def before_instantiate_classes(self) -> None:
         config = self.config[str(self.subcommand)]
         options, trainer = config.model.options, config.trainer
+        if config.model[self.tag] != self.chosen:
+            raise UserError(
+                f"model.{self.tag} is {config.model[self.tag]!r} in a place that comes too late: give the flag "
+                f"--model.{self.tag}, whole."
+            )
         plain = build(self.options, options.as_dict(), SECTION)
         build(Params, {"seed": config.model.seed}, "model")
+        self.check(plain, config.data.held_out)
         if trainer.max_epochs is None and trainer.max_steps == -1:
             trainer.max_epochs = plain.updates // plain.updates_per_epoch
         if trainer.gradient_clip_val is None:  # refused under the agents' manual optimisation, and they have none
-            trainer.gradient_clip_val = options.get("gradient_clip")
+            trainer.gradient_clip_val = getattr(plain, "gradient_clip", None)
 
 
 class ModelCLI(_LinkedCLI):
     """`envtf model`, for one kind of world model."""
 
+    tag = "kind"
     verbs = ("fit", "validate", "test")
     links = {
         "model.seed": "data.seed",
@@ -122,19 +143,25 @@ class ModelCLI(_LinkedCLI):
 
     def link_more(self, parser: LightningArgumentParser) -> None:
         if self.options is TransformerOptions:
-            parser.link_arguments("model.options.context", "data.context")
+            parser.link_arguments("model.options.context", "data.context", compute_fn=_plain)
+            parser.link_arguments("model.options.context", "data.members", compute_fn=lambda _: None)
         else:
-            parser.link_arguments("model.options.members", "data.members")
-            parser.set_defaults({"data.context": 1})
+            parser.link_arguments("model.options.members", "data.context", compute_fn=lambda _: 1)
+            parser.link_arguments("model.options.members", "data.members", compute_fn=_plain)
 
     @staticmethod
     def architecture(folder: str) -> dict[str, Any]:
         return model_architecture(folder)
 
+    @staticmethod
+    def check(options: Any, held_out: float) -> None:
+        build(DownloadOptions, {"held_out": held_out}, "data")
+
 
 class AgentCLI(_LinkedCLI):
     """`envtf agent`, for one algorithm."""
 
+    tag = "algorithm"
     verbs = ("fit", "validate")
     from_data = ("observation_dim", "action_dim", "action_low", "action_high")
     links = {f"model.options.{name}": f"data.{name}" for name in ("batch_size", "discount", "n_step")} | {
@@ -150,15 +177,17 @@ class AgentCLI(_LinkedCLI):
     def architecture(folder: str) -> dict[str, Any]:
         return policy_architecture(folder)
 
+    @staticmethod
+    def check(options: Any, held_out: float) -> None:
+        if held_out != 0.0:
+            build(DownloadOptions, {"held_out": held_out}, "data")
+        if options.world_model != NO_WORLD_MODEL:
+            raise UserError(f"{SECTION}.world_model is {options.world_model}: leave it out, to learn from data alone.")
 
-def _shipped_configs(arguments: list[str]) -> Iterator[str]:
-    """The arguments, with `--config NAME` of a shipped configuration as its path."""
-    for before, argument in zip(["", *arguments], arguments, strict=False):
-        flag, _, value = argument.rpartition("=")
-        if before in ("--config", "-c") or flag == "--config":
-            shipped = CONFIGS / f"{value}.yaml"
-            value = str(shipped) if shipped.is_file() and not Path(value).exists() else value
-        yield f"{flag}={value}" if flag else value
+
+def _plain(value: float | None) -> float | None:
+    """A number of Python's own: those of jsonargparse's types cannot be written to a configuration."""
+    return value if value is None else int(value) if isinstance(value, int) else float(value)
 
 
 def run(kind: str, arguments: list[str]) -> None:
@@ -191,17 +220,18 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def _run(kind: str, arguments: list[str]) -> None:
-    arguments = [*_shipped_configs(arguments)]
+    arguments = with_shipped_configs(arguments)
     if kind == "model":
         name = _chosen("kind", arguments, KINDS, "transformer")
         cli, model, data, options = ModelCLI, world_model_of(name), LogWindows, KINDS[name]
     else:
-        name = _chosen("algorithm", arguments, ALGORITHMS, "cql")
+        classes = {name: algorithm.Options for name, algorithm in ALGORITHMS.items()}
+        name = _chosen("algorithm", arguments, classes, "cql")
         if ALGORITHMS[name].imagines:
             raise UserError(f"{name} needs a world model: add it below train_policy in params.yaml, and `dvc repro`.")
-        cli, model, data, options = AgentCLI, agent_of(name), LogTransitions, ALGORITHMS[name].Options
-    chosen = type(cli.__name__, (cli,), {"options": options})
-    chosen(
+        cli, model, data, options = AgentCLI, agent_of(name), LogTransitions, classes[name]
+    made = type(cli.__name__, (cli,), {"options": options, "chosen": name})
+    made(
         model,
         data,
         args=arguments,
@@ -221,31 +251,22 @@ def _run(kind: str, arguments: list[str]) -> None:
     )
 
 
-def _chosen(option: str, arguments: list[str], known: Mapping[str, Any], default: str) -> str:
-    """The value of `--model.OPTION`, on which the other options depend, among the arguments or in a --config file.
+def _chosen(tag: str, arguments: list[str], classes: Mapping[str, type], default: str) -> str:
+    """The value of `--model.TAG`, on which the other options depend: as given, or else that of what is started from.
 
     Raises:
-        UserError: an unknown one.
+        UserError: it is unknown, or another one than that of the checkpoint or the folder.
     """
-    flag, found = f"--model.{option}", default
-    for before, argument in zip(["", *arguments], arguments, strict=False):
-        name, _, value = argument.partition("=")
-        if before in ("--config", "-c") or name == "--config":
-            found = _configured(Path(value or argument), option) or found
-        if before == flag or (name == flag and value):
-            found = argument if before == flag else value
-    if found not in known:
-        raise UserError(f"{flag} is {found!r}: {did_you_mean(found, known)}")
-    return found
-
-
-def _configured(path: Path, option: str) -> str | None:
-    """What a configuration file says of the option; an odd file is for the parser to refuse."""
-    try:
-        tree = YAML(typ="safe", pure=True).load(path.read_text("utf-8"))
-        for section in (tree, tree.get("fit"), tree.get("validate"), tree.get("test")):
-            if isinstance(section, dict) and isinstance(section.get("model"), dict) and option in section["model"]:
-                return str(section["model"][option])
-    except (OSError, ValueError, AttributeError, YAMLError):
-        pass
-    return None
+    flag, asked, brought = f"--model.{tag}", given(f"model.{tag}", arguments), None
+    if asked is not None and asked not in classes:
+        raise UserError(f"{flag} is {asked!r}: {did_you_mean(asked, classes)}")
+    checkpoint, base = given("ckpt_path", arguments), given("model.init_from", arguments)
+    if checkpoint is not None and not LIGHTNINGS_OWN.match(checkpoint):
+        brought = checkpoint_class(checkpoint, classes)
+    elif base is not None and classes is KINDS:  # an actor is the same whatever trained it
+        brought = model_kind(base)
+    if asked is not None and brought not in (None, asked):
+        raise UserError(
+            f"{flag} is {asked}, and {checkpoint or base} is of the {tag} {brought}: give {flag} {brought}."
+        )
+    return asked or brought or default

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,19 @@ from envtf_lit.errors import UserError
 from envtf_lit.files import read_json
 from envtf_lit.options.schema import build
 from envtf_lit.pipeline.params import Params
-from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions
+from envtf_lit.world_models.options import KINDS
 
 PART = re.compile(r"[A-Za-z_]\w*(\.\w+)*", re.ASCII)  # of a module, as it can be frozen
-SAVED = {"environment_transformer": TransformerOptions, "ensemble_dynamics": EnsembleOptions}  # by a folder's kind
+SAVED = {"environment_transformer": "transformer", "ensemble_dynamics": "ensemble"}  # kinds, as folders name them
+
+
+def model_kind(folder: str | Path) -> str | None:
+    """The kind of a published world model, or None where the folder holds none.
+
+    Raises:
+        UserError: no config.json.
+    """
+    return SAVED.get(_config(folder)[0])
 
 
 def model_architecture(folder: str | Path) -> dict[str, Any]:
@@ -32,9 +41,9 @@ def model_architecture(folder: str | Path) -> dict[str, Any]:
     if kind not in SAVED:
         return {}
     given = {name: value for name, value in arguments.items() if name not in ("observation_dim", "action_dim")}
-    if kind == "ensemble_dynamics" and isinstance(given.get("hidden"), list):  # which its training's options go with
+    if SAVED[kind] == "ensemble" and isinstance(given.get("hidden"), list):  # one for each layer, or it is refused
         given["weight_decay"] = [0.0] * (len(given["hidden"]) + 1)
-    plain = _architecture(folder, SAVED[kind], given)
+    plain = _architecture(folder, KINDS[SAVED[kind]], given)
     plain.pop("weight_decay", None)
     return plain
 
@@ -52,7 +61,7 @@ def checkpoint_options(path: str | Path, cls: type[Any]) -> dict[str, Any]:
         UserError: the file is missing or is not such a checkpoint.
     """
     try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)["hyper_parameters"]
+        saved = _hyper_parameters(path)
         return {
             "options": _plain(cls, saved["options"], "options"),
             "seed": build(Params, {"seed": saved["seed"]}, "").seed,
@@ -65,6 +74,24 @@ def checkpoint_options(path: str | Path, cls: type[Any]) -> dict[str, Any]:
     except Exception:  # whatever unpickling raises; torch's own message recommends to run code found in the file
         reason = ""
     raise UserError(f"{path} is not a checkpoint of this model{reason}: give --ckpt_path a file that fit wrote.")
+
+
+def checkpoint_class(path: str | Path, classes: Mapping[str, type]) -> str | None:
+    """The name of the class whose options a checkpoint has; None where there is none, which `checkpoint_options` says.
+
+    Args:
+        path: of a checkpoint.
+        classes: of options, by name.
+    """
+    try:
+        names = set(_hyper_parameters(path)["options"])
+    except Exception:  # whatever unpickling raises
+        return None
+    return next((name for name, cls in classes.items() if {field.name for field in fields(cls)} == names), None)
+
+
+def _hyper_parameters(path: str | Path) -> dict[str, Any]:
+    return torch.load(path, map_location="cpu", weights_only=True, mmap=True)["hyper_parameters"]  # no weights read
 
 
 def _config(folder: str | Path) -> tuple[str, Mapping[str, Any]]:

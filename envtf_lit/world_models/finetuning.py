@@ -30,7 +30,7 @@ def start_from(
         _refuse_differences(model.arguments, base.arguments, base.arguments)
         model.load_state_dict(base.state_dict())
     else:
-        raise UserError(f"it is of another kind, {type(base).__name__}; see model.options.ensemble.")
+        raise UserError(f"it is of another kind, {type(base).__name__}; start from one of the same.")
 
 
 def _refuse_differences(mine: Mapping[str, object], theirs: Mapping[str, object], names: Iterable[str]) -> None:

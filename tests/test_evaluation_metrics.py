@@ -32,8 +32,9 @@ def collect(source: str) -> dict:
         dataset=data,
         source=source,
         robot=ROBOTS["hopper"],
+        labels={"bc": "BC", "cql": "CQL", "et_cql": "ET + CQL"},
         world_model=world_model_metrics(report, scale, parameters=123),
-        rollouts=456,
+        rollouts={"transitions": 456},
     )
 
 
@@ -56,10 +57,10 @@ def test_keys_are_exactly_those_promised(metrics):
             "teacher_forced_steps_0.01",
         },
         "rollouts": {"transitions"},
-        "policy": {"score_mean", "score_std", "return_mean", "return_std", "episodes"},
-        "baselines": {"bc", "cql"},
+        "policies": {"bc", "cql", "et_cql"},
     }
-    assert all(set(value) == {"score_mean", "score_std"} for value in metrics["baselines"].values())
+    names = {"label", "score_mean", "score_std", "return_mean", "return_std", "episodes"}
+    assert all(set(policy) == names for policy in metrics["policies"].values())
 
 
 def test_values_survive_json_and_are_right(metrics, tmp_path):
@@ -67,11 +68,12 @@ def test_values_survive_json_and_are_right(metrics, tmp_path):
     assert read_json(tmp_path / "metrics.json") == metrics
     assert metrics["dataset"]["transitions"] == 75
     assert metrics["dataset"]["episodes"] == 3
-    assert metrics["policy"]["return_mean"] == 200.0
-    assert metrics["policy"]["return_std"] == 100.0
-    hopper = ROBOTS["hopper"]
-    assert metrics["policy"]["score_mean"] == pytest.approx(hopper.normalised_score(200.0))
-    assert metrics["baselines"]["bc"]["score_std"] == 0.0
+    policy = metrics["policies"]["et_cql"]
+    assert (policy["label"], policy["episodes"]) == ("ET + CQL", 2)
+    assert (policy["return_mean"], policy["return_std"]) == (200.0, 100.0)
+    assert policy["score_mean"] == pytest.approx(ROBOTS["hopper"].normalised_score(200.0))
+    assert metrics["policies"]["cql"]["return_mean"] == 20.0
+    assert metrics["policies"]["bc"]["score_std"] == 0.0
     assert 0.3 < metrics["world_model"]["coverage_50"] < 0.7
 
 
@@ -85,8 +87,9 @@ def test_minaris_data_are_never_set_beside_d4rls_scores():
         "return_mean": pytest.approx(data.episode_returns.mean()),
         "return_max": pytest.approx(data.episode_returns.max()),
     }
-    assert metrics["policy"] == {"return_mean": 200.0, "return_std": 100.0, "episodes": 2}
-    assert metrics["baselines"]["bc"] == {"return_mean": 50.0, "return_std": 0.0}
+    policies = metrics["policies"]
+    assert policies["et_cql"] == {"label": "ET + CQL", "return_mean": 200.0, "return_std": 100.0, "episodes": 2}
+    assert policies["bc"] == {"label": "BC", "return_mean": 50.0, "return_std": 0.0, "episodes": 1}
 
 
 def test_dataset_scores_are_those_of_its_episodes():
