@@ -73,7 +73,7 @@ def test_a_suites_budgets_come_from_the_command_line() -> None:
 
 def test_the_plain_network_has_the_transformers_parameters() -> None:
     train = _plain(TransformerOptions(), EnsembleOptions(), 11, 3)
-    assert train.ensemble is not None and train.ensemble.members == 1
+    assert train.members == 1
     plain = EnsembleDynamics(11, 3, members=1, elites=1, hidden=train.hidden)
     transformer = EnvironmentTransformer(11, 3)
     sizes = [sum(p.numel() for p in model.parameters()) for model in (plain, transformer)]
