@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 
 from envtf_lit import load_world_model
 from envtf_lit.agents.cql import CQLOptions
-from envtf_lit.cli.arguments import given
+from envtf_lit.cli.arguments import given, of_today
 from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.options import DownloadOptions
 from envtf_lit.errors import UserError
@@ -212,3 +212,11 @@ def test_what_cannot_be_frozen_is_refused(
     assert sentence in refused(
         capsys, kind, "fit", NO_LOGGER, f"--model.freeze={parts}", **{**SIZES[kind], **RUN[kind]}
     )
+
+
+def test_flags_of_earlier_versions_are_taken_as_they_are_called_now() -> None:
+    flags = ["fit", "--model.options.model.layers", "1", "--model.options.updates_per_step=10", "--data.path=model.h5"]
+    assert of_today(flags) == ["fit", "--model.options.layers", "1", "--data.path=model.h5"]
+    assert of_today(["fit", "--model.options.critics", "2", "--model.seed=1"]) == ["fit", "--model.seed=1"]
+    with pytest.raises(UserError, match=r"updates_per_step is 7, and always 10 by now"):
+        of_today(["--model.options.updates_per_step", "7"])

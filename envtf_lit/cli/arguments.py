@@ -7,9 +7,13 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from envtf_lit.errors import UserError
+
 CONFIGS = Path(__file__).parent.parent / "configs"
 SHIPPED = ", ".join(sorted(path.stem for path in CONFIGS.glob("*.yaml")))
 CONFIG = ("--config", "-c")
+MOVED = ("--model.options.model.", "--model.options.")  # of earlier versions, and of today
+CONSTANTS = {f"--model.options.{name}": value for name, value in (("updates_per_step", 10), ("critics", 2))}
 
 
 def with_shipped_configs(arguments: list[str]) -> list[str]:
@@ -21,6 +25,27 @@ def with_shipped_configs(arguments: list[str]) -> list[str]:
             shipped = CONFIGS / f"{value}.yaml"
             value = str(shipped) if shipped.is_file() and not Path(value).exists() else value
         found.append(f"{flag}={value}" if flag else value)
+    return found
+
+
+def of_today(arguments: list[str]) -> list[str]:
+    """The arguments, with flags of earlier versions as they are called now; what is a constant now is left out.
+
+    Raises:
+        UserError: another value is asked of a constant.
+    """
+    found, waiting = list[str](), None
+    for argument in (argument.replace(*MOVED) if argument.startswith("--") else argument for argument in arguments):
+        flag, equals, value = argument.partition("=")
+        if waiting is not None or (flag in CONSTANTS and equals):
+            name, value = waiting or flag, argument if waiting else value
+            if value != str(CONSTANTS[name]):
+                raise UserError(f"{name} is {value}, and always {CONSTANTS[name]} by now: leave it out.")
+            waiting = None
+        elif flag in CONSTANTS:
+            waiting = flag
+        else:
+            found.append(argument)
     return found
 
 

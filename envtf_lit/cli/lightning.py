@@ -12,7 +12,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from envtf_lit.agents.options import NO_WORLD_MODEL
 from envtf_lit.agents.registry import ALGORITHMS
-from envtf_lit.cli.arguments import SHIPPED, given, with_shipped_configs
+from envtf_lit.cli.arguments import SHIPPED, given, of_today, with_shipped_configs
 from envtf_lit.cli.components import LogTransitions, LogWindows, agent_of, world_model_of
 from envtf_lit.cli.publish import KeepConfig, Publish
 from envtf_lit.cli.saved_options import (
@@ -220,7 +220,7 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def _run(kind: str, arguments: list[str]) -> None:
-    arguments = with_shipped_configs(arguments)
+    arguments = of_today(with_shipped_configs(arguments))
     if kind == "model":
         name = _chosen("kind", arguments, KINDS, "transformer")
         cli, model, data, options = ModelCLI, world_model_of(name), LogWindows, KINDS[name]
