@@ -51,8 +51,8 @@ def assert_equal(first: OfflineDataset, second: OfflineDataset) -> None:
         one, two = getattr(first, name), getattr(second, name)
         assert one.dtype == two.dtype, name
         assert np.array_equal(one, two), name
-    assert (first.held_out is None) == (second.held_out is None)
-    assert first.held_out is None or np.array_equal(first.held_out, second.held_out)
+    held_out = [None if dataset.held_out is None else dataset.held_out.tolist() for dataset in (first, second)]
+    assert held_out[0] == held_out[1]
     assert first.task == second.task
 
 

@@ -23,8 +23,9 @@ from envtf_lit.studies.ablation import VARIANTS, run_ablation
 from envtf_lit.studies.horizon import ONLINE, SIZES, HorizonOptions, HorizonStudy
 from envtf_lit.studies.study import run_study
 from envtf_lit.studies.suite import MODELS, Suite, SuiteOptions, build_suite, model_options
-from envtf_lit.world_models.options import EnsembleOptions
+from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions
 from envtf_lit.world_models.store import load_world_model
+from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 ENSEMBLE = EnsembleOptions(
     members=2, elites=1, hidden=(8,), weight_decay=(0.0, 0.0), updates=2, updates_per_epoch=2, batch_size=8
@@ -145,13 +146,17 @@ def test_variants_are_trained_and_measured_beside_the_suite(tmp_path: Path) -> N
     assert json.loads(out.read_text()) == numbers
     assert all(f"hopper.{name}.open_loop_0.1" in numbers for name in (*MODELS, *names))
     assert numbers["hopper.updates_x2.updates"] == 2 * numbers["hopper.context_8.updates"] == 4
-    model = load_world_model(tmp_path / "hopper-medium/models/context_8")
-    assert model.options == replace(load_world_model(tmp_path / "hopper-medium/models/transformer").options, context=8)
+    changed, plain = (
+        load_world_model(tmp_path / f"hopper-medium/models/{name}") for name in ("context_8", "transformer")
+    )
+    assert isinstance(changed, EnvironmentTransformer) and isinstance(plain, EnvironmentTransformer)
+    assert changed.options == replace(plain.options, context=8)
     assert set(pd.read_csv(tmp_path / "ablation/ceiling.csv")["model"]) == {*MODELS, *names, "physics"}
 
 
 def test_variants_see_as_many_steps_per_update() -> None:
     plain = model_options("transformer", SuiteOptions())
+    assert isinstance(plain, TransformerOptions)
     for change in VARIANTS.values():
         train = change(plain)
         assert train != plain and train.batch_size * train.context == plain.batch_size * plain.context

@@ -82,7 +82,7 @@ def test_a_kill_between_training_and_publication_loses_no_training(root, monkeyp
 
 
 def test_what_was_trained_is_there_until_the_block_that_publishes_has_succeeded(root, monkeypatch):
-    data = window_data(str(root / "data/dataset.h5"), MODEL, held_out=0.2, seed=0)
+    data = window_data(str(root / "data/dataset.h5"), MODEL, seed=0)
 
     def train(seed: int) -> Any:
         lit = lit_world_model(data.observation_dim, data.action_dim, MODEL, seed=seed)

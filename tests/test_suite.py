@@ -51,7 +51,8 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(
     assert build_suite("hopper-medium", tmp_path, TINY, progress=False) == suite
     options = TransformerOptions(layers=1, heads=1, width=8, bounded=True, updates=2, updates_per_epoch=2)
     add_model(suite, "bounded", options, progress=False)
-    assert load_world_model(suite.folders["bounded"]).options.bounded
+    bounded = load_world_model(suite.folders["bounded"])
+    assert isinstance(bounded, EnvironmentTransformer) and bounded.options.bounded
     assert suite.costs["hopper.bounded.train_seconds"] > 0
     assert suite.costs["hopper.bounded.updates"] == 2 and suite.costs["hopper.ensemble.updates"] == 4
     changed = replace(TINY, ensemble=replace(ENSEMBLE, hidden=(9,)))

@@ -197,7 +197,7 @@ def test_compiled_training_learns_what_plain_training_learns(root, monkeypatch):
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_gradients_are_clipped_before_a_step_in_one_pass(root, precision):
-    data = window_data(str(root / "data/dataset.h5"), MODEL, held_out=0.2, seed=0)
+    data = window_data(str(root / "data/dataset.h5"), MODEL, seed=0)
     lit = lit_world_model(data.observation_dim, data.action_dim, MODEL)
     norms = Norms()
     with trained(
