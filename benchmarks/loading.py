@@ -1,4 +1,4 @@
-"""Do data reach the learners in time, and what memory does a large log cost: `python benchmarks/loading.py [OUT.json]`.
+"""Loading: milliseconds per batch, and the memory that a large log costs: `python benchmarks/loading.py [OUT.json]`.
 
 Writes a log of 2,000,000 rows with the dimensions of Ant-105 (1.8 GB) and one of 20,000 into a temporary folder, and
 trains the small preset's world model and agent on both, each in a process of its own. Prints the milliseconds that a
@@ -24,12 +24,14 @@ import torch
 
 from envtf_lit.agents.cql import CQL
 from envtf_lit.data.columns import blocks
+from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import TransitionData, WindowData, Windows
+from envtf_lit.data.loaders import Windows
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.pipeline.params import Params
 from envtf_lit.training import trained
 from envtf_lit.world_models.lit import LitWorldModel
+from envtf_lit.world_models.options import ModelOptions, TransformerOptions
 
 LARGE, SMALL = 2_000_000, 20_000
 S, A, EPISODE = 105, 8, 1_000
@@ -103,12 +105,13 @@ def measure(path: Path, learner: str) -> dict[str, Any]:
     """Gives batches to nobody, then to a learner; in a process of its own."""
     memory, params = Memory(), Params()
     torch.set_num_threads(1)
-    model, policy = params.train_model, params.train_policy.cql
+    model, policy = params.train_model["transformer"], params.train_policy["cql"]
+    assert isinstance(model, TransformerOptions)
     if learner == "world model":
-        data = WindowData(str(path), model.model.context, model.batch_size, WINDOW_BATCHES, seed=0)
+        data = WindowData(str(path), model.context, model.batch_size, WINDOW_BATCHES, seed=0)
         module, steps = LitWorldModel(S, A, model), WINDOW_BATCHES
     else:
-        data = TransitionData(str(path), policy.batch_size, policy.updates_per_step, ROW_BATCHES, n_step=policy.n_step)
+        data = TransitionData(str(path), policy.batch_size, ROW_BATCHES, n_step=policy.n_step)
         module, steps = CQL(S, A, policy), ROW_BATCHES
     data.setup("fit")
     loaded = loading_ms(data.train_dataloader(), steps)
@@ -152,9 +155,7 @@ def main(folder: Path) -> dict[str, Any]:
             command = [sys.executable, __file__, "--measure", str(path), learner]
             process = subprocess.run(command, capture_output=True, text=True, check=True)
             result[f"{learner}, {rows} rows"] = json.loads(process.stdout.splitlines()[-1])
-    result["window_index_seconds_per_million_rows"] = index_seconds(
-        folder / f"{LARGE}.h5", Params().train_model.model.context
-    )
+    result["window_index_seconds_per_million_rows"] = index_seconds(folder / f"{LARGE}.h5", ModelOptions().context)
     for learner in ("world model", "agent"):
         large, small = (result[f"{learner}, {rows} rows"]["VmHWM_mb"] for rows in (LARGE, SMALL))
         result[f"{learner}, mb more for the large log"] = large - small

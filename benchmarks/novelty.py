@@ -1,9 +1,9 @@
-"""What tells strange pairs from familiar ones: `python benchmarks/novelty.py --out OUT.json --robots hopper ant`.
+"""Detection of out-of-distribution pairs: `python benchmarks/novelty.py --out OUT.json --robots hopper ant`.
 
 First the posterior of the last layer, with more or fewer random features beside the hidden token. Then random-prior
 heads (Osband et al. 2018): ten small networks on the hidden token, each with a fixed random network of its own added,
-which learn the transformer's training residuals; where they disagree, data were lacking. Judged as `envtf calibrate`
-judges, on the same pairs. The suite's transformer is taken from the work folder, or trained.
+which learn the transformer's training residuals; where they disagree, data were lacking. Measured as `envtf calibrate`
+measures, on the same pairs. The suite's transformer is taken from the work folder, or trained.
 """
 
 import argparse
@@ -21,10 +21,10 @@ from envtf_lit.data.loaders import Windows
 from envtf_lit.evaluation.calibration import Points, auroc
 from envtf_lit.files import write_json
 from envtf_lit.robots.tasks import ROBOTS, Task, get_task
-from envtf_lit.studies.calibration import CalibrationOptions, Course
-from envtf_lit.studies.suite import WORK, Suite, SuiteOptions, build_suite, heading
+from envtf_lit.studies.calibration import CalibrationData, CalibrationOptions
+from envtf_lit.studies.suite import WORK, Suite, SuiteOptions, build_suite, result_header
 from envtf_lit.world_models.lit import LitWorldModel, window_data
-from envtf_lit.world_models.options import TrainModelOptions
+from envtf_lit.world_models.options import TransformerOptions
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
@@ -47,13 +47,13 @@ class Networks(nn.Module):
 
 def tokens(model: EnvironmentTransformer, points: Points) -> tuple[Tensor, Tensor]:
     """Last hidden tokens (N, D), and the normalised pairs (N, S + A) they end in."""
-    last, rows = points.lengths - 1, torch.arange(len(points.actions))
-    actions = nn.functional.pad(points.past_actions, (0, 0, 0, 1))
+    last, rows = points.histories.lengths - 1, torch.arange(len(points.actions))
+    actions = nn.functional.pad(points.histories.actions, (0, 0, 0, 1))
     actions[rows, last] = points.actions
     with torch.no_grad():
-        parts = zip(points.observations.split(1_024), actions.split(1_024), strict=True)
+        parts = zip(points.histories.observations.split(1_024), actions.split(1_024), strict=True)
         hidden = torch.cat([model.encode(*part, cached=False)[0] for part in parts])[rows, last]
-        return hidden, model.normaliser.token(points.observations[rows, last], points.actions)
+        return hidden, model.normaliser.token(points.histories.observations[rows, last], points.actions)
 
 
 def train(
@@ -83,10 +83,11 @@ def train(
 
 def refit(model: EnvironmentTransformer, suite: Suite, count: int) -> EnvironmentTransformer:
     """The same network with a posterior that sees so many random features, fitted as after training."""
-    options = TrainModelOptions(model=replace(model.options, random_features=count))
+    options = TransformerOptions(**vars(replace(model.options, random_features=count)))
     data = window_data(str(suite.dataset), options, seed=suite.options.seed)
     data.setup("fit")
     lit = LitWorldModel(model.observation_dim, model.action_dim, options, suite.options.seed)
+    assert isinstance(lit.model, EnvironmentTransformer)
     anew = ("random_features.", "laplace.")
     lit.model.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith(anew)}, strict=False)
     lit.fit_uncertainty(data)
@@ -119,22 +120,22 @@ def measure(task: Task, suite: Suite, given: argparse.Namespace) -> Iterator[dic
     """One robot's numbers, kind by kind."""
     model = load_world_model(suite.folders["transformer"])
     assert isinstance(model, EnvironmentTransformer)
-    course = Course(task, suite, CalibrationOptions(), True)
+    data = CalibrationData(task, suite, CalibrationOptions(), True)
     for count in given.features:
         other = refit(model, suite, count)
-        numbers, _ = course.detection(other)
-        numbers |= {"rank_correlation": course.rollouts(other)[0]["rank_correlation"]}
+        numbers, _ = data.detection(other)
+        numbers |= {"rank_correlation": data.rollouts(other)[0]["rank_correlation"]}
         assert other.laplace is not None
-        numbers |= {"scale": float(other.laplace.scale), "milliseconds": milliseconds(other, course.familiar)}
+        numbers |= {"scale": float(other.laplace.scale), "milliseconds": milliseconds(other, data.in_distribution)}
         yield {f"{task.robot.name}.features_{count}.{name}": value for name, value in numbers.items()}
     windows = Windows(suite.split()[0], model.options.context)
     for weight in given.weights:
         begin = time.perf_counter()
         learner, prior = train(model, windows, weight, torch.Generator().manual_seed(given.seed))
-        familiar = spread(model, learner, prior, weight, course.familiar)
+        inside = spread(model, learner, prior, weight, data.in_distribution)
         numbers = {
-            f"auroc_{contrast}": auroc(familiar, spread(model, learner, prior, weight, points))
-            for contrast, points in course.strange.items()
+            f"auroc_{contrast}": auroc(inside, spread(model, learner, prior, weight, points))
+            for contrast, points in data.out_of_distribution.items()
         } | {"seconds": round(time.perf_counter() - begin, 1)}
         yield {f"{task.robot.name}.priors_{weight:g}.{name}": value for name, value in numbers.items()}
 
@@ -154,7 +155,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     options = SuiteOptions(transitions=given.transitions, updates=given.updates, seed=given.seed, threads=given.threads)
-    result = heading(given.tier, options, calibration=CalibrationOptions())
+    result = result_header(given.tier, options, calibration=CalibrationOptions())
     for robot in given.robots:
         task = get_task(f"{robot}-{given.tier}")
         suite = build_suite(task.name, given.work, options, models=("transformer",))

@@ -19,9 +19,11 @@ def columns(observation_dim: int = 11, action_dim: int = 3) -> Columns:
     rows = 12
     flags = np.zeros((2, rows), bool)
     flags[0, 3] = flags[1, 6] = True
+    observations, actions = rng.normal(size=(rows, observation_dim)), rng.uniform(-1, 1, (rows, action_dim))
+    actions[8], actions[9] = -1, 1  # so that they fill their space
     return {
-        "observations": rng.normal(size=(rows, observation_dim)).astype(np.float32),
-        "actions": rng.uniform(-1, 1, (rows, action_dim)).astype(np.float32),
+        "observations": observations.astype(np.float32),
+        "actions": actions.astype(np.float32),
         "rewards": rng.normal(size=rows).astype(np.float32),
         "next_observations": rng.normal(size=(rows, observation_dim)).astype(np.float32),
         "terminals": flags[0],
@@ -49,6 +51,8 @@ def assert_equal(first: OfflineDataset, second: OfflineDataset) -> None:
         one, two = getattr(first, name), getattr(second, name)
         assert one.dtype == two.dtype, name
         assert np.array_equal(one, two), name
+    assert (first.held_out is None) == (second.held_out is None)
+    assert first.held_out is None or np.array_equal(first.held_out, second.held_out)
     assert first.task == second.task
 
 

@@ -1,44 +1,51 @@
-"""CQL's equations on hand-computed cases, gradient isolation, the imagined ring, and stacked critics."""
+"""Agents: phases, optimisers by name, the equations of SAC, CQL and COMBO by hand, starting from another actor."""
 
-import copy
 import math
-from typing import Literal
+from typing import Any
 
 import pytest
 import torch
-from envtf_lit.agents.ring import ImaginedRing
 from torch import nn
 
+from envtf_lit.agents.agent import Agent
+from envtf_lit.agents.bc import BC
+from envtf_lit.agents.combo import COMBO
 from envtf_lit.agents.cql import CQL
+from envtf_lit.agents.et_cql import ETCQL, ETCQLPaper
 from envtf_lit.agents.networks import StackedCritics
-from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.sac import SAC
 from envtf_lit.errors import UserError
-from envtf_lit.imagination.options import ImaginationOptions
-from envtf_lit.imagination.rollouts import Rollouts
 from envtf_lit.policy import TanhGaussianActor
+from tests.hand_driven import B, S, hand_driven, imagining, make_batch
 
-S, A, B = 3, 2, 8
-
-
-def make_agent(imagination: ImaginationOptions | None = None, **options) -> CQL:
-    torch.manual_seed(0)
-    agent = CQL(S, A, PolicyOptions(hidden=(16, 16), warm_start=0, imagination=imagination, **options))
-    agent.generator = torch.Generator().manual_seed(0)
-    agent.update_index = 0
-    return agent
+A = 2  # actions, where no linear world is in play
 
 
-def make_batch(agent: CQL, real: int = B) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(1)
-    return dict(
-        observations=torch.randn(B, S, generator=generator),
-        actions=torch.rand(B, A, generator=generator) * 2 - 1,
-        rewards=torch.randn(B, generator=generator),
-        next_observations=torch.randn(B, S, generator=generator),
-        discounts=torch.full((B,), 0.99),
-        returns=torch.randn(B, generator=generator),
-        real=(torch.arange(B) < real).float(),
-    )
+IMAGINING = [(COMBO, {}), (ETCQLPaper, {}), (ETCQL, {"value_gradient": None})]
+
+
+def make_agent(cls: type[Agent] = CQL, **options: Any) -> Any:
+    return hand_driven(cls, action_dim=A, **options)
+
+
+# behaviour cloning
+
+
+def test_cloning_makes_the_logs_actions_likelier():
+    agent, batch = make_agent(BC, actor_learning_rate=0.01), make_batch(A)
+    before = agent.actor.log_prob(batch["observations"], batch["actions"]).mean().item()
+    losses = [float(agent.update(batch)["clone_loss"].detach()) for _ in range(30)]
+    after = agent.actor.log_prob(batch["observations"], batch["actions"]).mean()
+    assert losses[0] == pytest.approx(-before, rel=1e-5) and after > before + 0.5
+
+
+def test_cloning_knows_real_rows_alone():
+    agent, batch = make_agent(BC), make_batch(A, real=3)
+    log_density = agent.actor.log_prob(batch["observations"], batch["actions"])
+    torch.testing.assert_close(agent.clone_loss(batch), -log_density[:3].mean())
+
+
+# soft actor-critic and conservative Q-learning
 
 
 class ConstantCritics(nn.Module):
@@ -48,13 +55,24 @@ class ConstantCritics(nn.Module):
         return torch.tensor([5.0, 3.0])[:, None].expand(2, len(observation))
 
 
-def test_td_target_takes_the_smaller_critic_and_stops_only_at_termination():
-    agent = make_agent()
-    agent.target_critics = ConstantCritics()  # pyright: ignore[reportAttributeAccessIssue]
-    batch = make_batch(agent)
+@pytest.mark.parametrize(("cls", "entropy"), [(SAC, True), (CQL, False)])
+def test_td_target_takes_the_smaller_critic_and_stops_only_at_termination(cls, entropy):
+    """With the entropy of the next action in soft actor-critic, without it in CQL."""
+    agent, batch = make_agent(cls), make_batch(A)
+    agent.target_critics = ConstantCritics()
+    nn.init.constant_(agent.temperature.log_alpha, math.log(0.5))
     batch["rewards"], batch["discounts"] = torch.ones(B), torch.tensor([0.0, 0.9] * (B // 2))
-    target = agent.td_target(batch, agent.generator)
-    torch.testing.assert_close(target, torch.tensor([1.0, 1.0 + 0.9 * 3.0] * (B // 2)))
+    _, log_density = agent.actor.sample(batch["next_observations"], generator=torch.Generator().manual_seed(0))
+    following = 3.0 - 0.5 * log_density if entropy else torch.full((B,), 3.0)
+    torch.testing.assert_close(agent.td_target(batch), 1.0 + batch["discounts"] * following)
+
+
+def test_the_critics_of_soft_actor_critic_regress_on_the_target():
+    agent, batch = make_agent(SAC), make_batch(A)
+    loss, _ = agent.critic_loss(batch)
+    agent.generator.manual_seed(0)
+    target, q = agent.td_target(batch), agent.critics(batch["observations"], batch["actions"])
+    torch.testing.assert_close(loss, sum(0.5 * (one - target).square().mean() for one in q))
 
 
 def test_conservative_gap_is_zero_for_a_flat_q_under_uniform_proposals():
@@ -66,70 +84,75 @@ def test_conservative_gap_is_zero_for_a_flat_q_under_uniform_proposals():
 
 
 def test_conservative_gap_against_a_plain_log_sum_exp():
-    agent = make_agent(temperature=2.0)
+    agent = make_agent()
     q, proposed, density = torch.randn(2, B), torch.randn(2, B, 3), torch.randn(B, 3)
     expected = torch.zeros(2)
     for n in range(2):
         for b in range(B):
-            terms = [math.exp(float(proposed[n, b, j]) / 2.0 - float(density[b, j])) for j in range(3)]
-            expected[n] += (2.0 * math.log(sum(terms) / 3) - float(q[n, b])) / B
+            terms = [math.exp(float(proposed[n, b, j]) - float(density[b, j])) for j in range(3)]
+            expected[n] += (math.log(sum(terms) / 3) - float(q[n, b])) / B
     torch.testing.assert_close(agent.conservative_gap(q, proposed, density, torch.ones(B)), expected)
 
 
-def test_penalty_up_on_real_ignores_q_at_imagined_actions():
-    q, proposed, density = torch.zeros(2, B), torch.zeros(2, B, 3), torch.zeros(B, 3)
-    raised = q.clone()
+@pytest.mark.parametrize(("cls", "options"), IMAGINING)
+def test_q_is_pushed_up_on_real_rows_alone_or_as_in_the_paper_on_all(cls, options):
+    agent, raised, everywhere = imagining(cls, **options), torch.zeros(2, B), cls is ETCQLPaper
+    proposed, density = torch.zeros(2, B, 3), torch.zeros(B, 3)
     raised[:, B // 2 :] = 100.0  # imagined rows
-    real = (torch.arange(B) < B // 2).float()
-    cases: list[tuple[Literal["real", "mixture"], bool]] = [("real", False), ("mixture", True)]
-    for where, changes in cases:
-        agent = make_agent(ImaginationOptions(penalty_up_on=where, buffer_size=10))
-        before, after = (agent.conservative_gap(x, proposed, density, real) for x in (q, raised))
-        assert torch.equal(before, after) is not changes
+    for real, up in ((torch.arange(B) < B // 2, 50.0 if everywhere else 0.0), (torch.ones(B), 50.0)):
+        gap = agent.conservative_gap(raised, proposed, density, real.float())
+        torch.testing.assert_close(gap, torch.full((2,), -up))
 
 
 def test_proposals_come_from_the_action_range_with_matching_densities():
     agent = make_agent(sampled_actions=500)
-    actions, density = agent.proposals(make_batch(agent), agent.generator)
+    actions, density = agent.proposals(make_batch(A))
     assert actions.shape == (B, 1500, A) and density.shape == (B, 1500)
     uniform = actions[:, :500]
     assert uniform.min() < -0.99 and uniform.max() > 0.99 and abs(uniform.mean()) < 0.05
-    now = agent.actor.log_prob(
-        make_batch(agent)["observations"].repeat_interleave(500, 0), actions[:, 500:1000].flatten(0, 1)
-    )
-    inside = actions[:, 500:1000].flatten(0, 1).abs().amax(-1) < 0.99
-    torch.testing.assert_close(density[:, 500:1000].flatten()[inside], now[inside], atol=1e-2, rtol=1e-3)
+    assert (density[:, :500] == -A * math.log(2.0)).all()
+    for name, first in (("observations", 500), ("next_observations", 1000)):
+        drawn = actions[:, first : first + 500].flatten(0, 1)
+        states = make_batch(A)[name].repeat_interleave(500, 0)
+        inside = drawn.abs().amax(-1) < 0.99
+        expected = agent.actor.log_prob(states, drawn)[inside]
+        found = density[:, first : first + 500].flatten()[inside]
+        torch.testing.assert_close(found, expected, atol=1e-2, rtol=1e-3)
 
 
-def test_actor_loss_reaches_the_actor_alone_and_critic_loss_the_critics_alone():
-    agent = make_agent()
-    batch = make_batch(agent)
-    loss, _ = agent.critic_loss(batch, agent.generator)
-    loss.backward()
-    assert all(p.grad is None for p in [*agent.actor.parameters(), *agent.target_critics.parameters(), agent.log_alpha])
-    assert all(p.grad is not None for p in agent.critics.parameters())
-    agent.zero_grad(set_to_none=True)
-    agent.critics.requires_grad_(False)
-    loss, _ = agent.actor_loss(batch, agent.generator)
-    loss.backward()
-    assert all(p.grad is None for p in [*agent.critics.parameters(), agent.log_alpha])
-    assert all(p.grad is not None for p in agent.actor.parameters())
+@pytest.mark.parametrize("cls", [SAC, CQL])
+def test_each_loss_reaches_its_own_part_alone(cls):
+    agent, seen = make_agent(cls), []
+    for part, loss, _ in agent.losses(make_batch(A)):
+        agent.zero_grad(set_to_none=True)
+        loss.backward()
+        reached = {name for name, weight in agent.named_parameters() if weight.grad is not None}
+        assert reached == {name for name, _ in agent.named_parameters() if name.startswith(f"{part}.")}
+        seen.append(part)
+    assert seen == ["critics", "actor", "temperature"]
+    assert all(p.requires_grad for p in agent.critics.parameters())  # held fixed for the actor's loss alone
 
 
 def test_temperature_falls_when_entropy_is_above_its_target():
     agent = make_agent()
     for entropy, sign in ((-A + 1.0, 1.0), (-A - 1.0, -1.0)):
-        (gradient,) = torch.autograd.grad(agent.temperature_loss(torch.tensor(entropy)), agent.log_alpha)
+        loss = agent.temperature_loss(torch.tensor(entropy))
+        (gradient,) = torch.autograd.grad(loss, agent.temperature.log_alpha)
         assert math.copysign(1.0, float(gradient)) == sign
 
 
-def test_targets_move_by_their_rate():
-    agent = make_agent(target_rate=0.25)
-    before = copy.deepcopy(agent.target_critics.state_dict())
-    nn.init.ones_(agent.critics.out.weight)
-    agent.follow()
-    expected = 0.75 * before["out.weight"] + 0.25
-    torch.testing.assert_close(agent.target_critics.out.weight.data, expected)
+def test_targets_and_average_move_by_their_rates():
+    agent = make_agent(target_rate=0.25, actor_average=0.5)
+    for follower, leader, rate in (
+        (agent.target_critics, agent.critics, 0.25),
+        (agent.average_actor, agent.actor, 0.5),
+    ):
+        before = [weight.clone() for weight in follower.parameters()]
+        for weight in leader.parameters():
+            nn.init.ones_(weight)
+        agent.update_targets()
+        for old, new in zip(before, follower.parameters(), strict=True):
+            torch.testing.assert_close(new, (1.0 - rate) * old + rate)
 
 
 def test_stacked_critics_equal_one_network_per_member():
@@ -149,69 +172,6 @@ def test_stacked_critics_equal_one_network_per_member():
         x = x @ critics.out.weight[member] + critics.out.bias[member]
         torch.testing.assert_close(q[member], x[..., 0], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(critics(observation, actions[:, 0]), q[..., 0])
-
-
-def test_ring_keeps_the_newest():
-    ring = ImaginedRing(S, A, capacity=5)
-    column = lambda start, n: dict(  # noqa: E731
-        observations=torch.zeros(n, S),
-        actions=torch.zeros(n, A),
-        rewards=torch.arange(start, start + n).float(),
-        next_observations=torch.zeros(n, S),
-        discounts=torch.zeros(n),
-    )
-    ring.add(column(0, 3))
-    assert len(ring) == 3
-    ring.add(column(3, 4))
-    assert sorted(ring.get_buffer("rewards").tolist()) == [2, 3, 4, 5, 6]
-    ring.add(column(7, 12))
-    assert sorted(ring.get_buffer("rewards").tolist()) == [14, 15, 16, 17, 18]
-    assert set(ring.draw(200, torch.Generator().manual_seed(0))["rewards"].tolist()) == {14, 15, 16, 17, 18}
-
-
-def make_rollouts(n: int) -> Rollouts:
-    return Rollouts(
-        observations=torch.zeros(n, S),
-        actions=torch.zeros(n, A),
-        rewards=torch.ones(n),
-        next_observations=torch.ones(n, S),
-        terminated=torch.zeros(n, dtype=torch.bool),
-        halted=torch.zeros(n, dtype=torch.bool),
-        aleatoric=torch.zeros(n, S + 1),
-        uncertainty=torch.full((n,), 0.5),
-        branch=torch.arange(n),
-        step=torch.zeros(n, dtype=torch.long),
-    )
-
-
-def test_mixing_keeps_the_real_ratio_and_charges_for_uncertainty():
-    agent = make_agent(ImaginationOptions(real_ratio=0.75, penalty=2.0, refresh_every=0, buffer_size=20))
-    agent.reward_std = 3.0
-    agent.remember(make_rollouts(10))
-    batch = make_batch(agent)
-    mixed = agent.mix(batch)
-    assert mixed["real"].tolist() == [1.0] * 6 + [0.0] * 2
-    assert torch.equal(mixed["rewards"][:6], batch["rewards"][:6])
-    assert mixed["rewards"][6:].tolist() == [1.0 - 2.0 * 3.0 * 0.5] * 2
-    torch.testing.assert_close(mixed["discounts"][6:], torch.full((2,), agent.options.discount))
-
-
-def test_steps_of_the_tail_enter_targets_but_not_the_ring():
-    agent = make_agent(ImaginationOptions(horizon=1, tail=1, buffer_size=20), discount=0.5)
-    rollouts = make_rollouts(4)
-    rollouts.branch[2:] = rollouts.branch[:2]
-    rollouts.step[2:] = 1  # two rollouts of two steps
-    agent.remember(rollouts)
-    assert agent.ring is not None and len(agent.ring) == 2
-    assert agent.ring.get_buffer("rewards")[:2].tolist() == [1.5, 1.5]
-    assert agent.ring.get_buffer("discounts")[:2].tolist() == [0.25, 0.25]
-
-
-def test_rewards_are_divided_by_the_return_scale():
-    agent = make_agent(ImaginationOptions(refresh_every=0, buffer_size=20))
-    agent.return_scale.fill_(4.0)
-    agent.remember(make_rollouts(2))
-    assert agent.ring is not None and agent.ring.get_buffer("rewards")[:2].tolist() == [0.25, 0.25]
 
 
 # starting from another policy

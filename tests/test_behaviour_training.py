@@ -15,7 +15,7 @@ from envtf_lit.robots.tasks import ROBOTS, get_task
 from envtf_lit.zoo import train as behaviour_training
 from envtf_lit.zoo.collect import collect
 from envtf_lit.zoo.snapshots import ZOO, Series, load_snapshot, read_series
-from envtf_lit.zoo.train import RECIPES, RENORM_EPSILON, _stretch, flax_to_torch, settle, train
+from envtf_lit.zoo.train import RECIPES, RENORM_EPSILON, _stretch, average_last_snapshots, flax_to_torch, train
 
 HOPPER = ROBOTS["hopper"]
 
@@ -129,7 +129,7 @@ def test_settling_averages_the_late_snapshots_and_calms_them(
     log_std = (late[0].bias + late[1].bias)[3:] / 2 + np.log(0.25)
     torch.testing.assert_close(layer.bias[3:], log_std)
     with pytest.raises(UserError, match="settled before"):
-        settle(HOPPER, tmp_path)
+        average_last_snapshots(HOPPER, tmp_path)
 
 
 def test_settling_that_is_interrupted_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,7 +142,7 @@ def test_settling_that_is_interrupted_changes_nothing(tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(behaviour_training, "write_json", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        settle(HOPPER, tmp_path)
+        average_last_snapshots(HOPPER, tmp_path)
     assert {path.name: path.read_bytes() for path in (tmp_path / "hopper").iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["hopper"]
 
@@ -151,4 +151,4 @@ def test_settling_that_is_interrupted_changes_nothing(tmp_path: Path, monkeypatc
 def test_settling_refuses_what_cannot_be(tmp_path: Path, last: int, noise: float) -> None:
     shutil.copytree(ZOO / "hopper", tmp_path / "hopper")
     with pytest.raises(UserError, match="has 19 snapshots"):
-        settle(HOPPER, tmp_path, last=last, noise=noise)
+        average_last_snapshots(HOPPER, tmp_path, last=last, noise=noise)

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from envtf_lit.errors import UserError
-from envtf_lit.studies import calibration
-from envtf_lit.studies.calibration import CONTRASTS, CalibrationOptions
+from envtf_lit.studies.calibration import CONTRASTS, CalibrationOptions, CalibrationStudy
+from envtf_lit.studies.study import run_study
 from envtf_lit.studies.suite import MODELS, SuiteOptions, add_model, build_suite, model_params
 from envtf_lit.world_models.options import EnsembleOptions
 
@@ -20,7 +20,7 @@ ENSEMBLE = EnsembleOptions(
     members=3, elites=2, hidden=(8,), weight_decay=(0.0, 0.0), updates=4, updates_per_epoch=2, batch_size=8
 )
 TINY = SuiteOptions(transitions=3_000, updates=2, ensemble=ENSEMBLE, threads=1)
-FEW = CalibrationOptions(points=50, strange_rows=500, episodes=2, rollouts=5, rollout_steps=3)
+FEW = CalibrationOptions(points=50, out_of_distribution_rows=500, episodes=2, rollouts=5, rollout_steps=3)
 
 
 NAMES = ("coverage_50", "coverage_90", "rank_correlation", *(f"auroc_{name}" for name in CONTRASTS))
@@ -43,8 +43,10 @@ def as_drawn(table: pd.DataFrame, numbers: dict[str, float]) -> None:
 @pytest.mark.filterwarnings("ignore:.*treespec, LeafSpec:FutureWarning")
 def test_models_are_measured_once_and_drawn(tmp_path: Path) -> None:
     lines = list[str]()
-    facts: dict[str, Any] = dict(robots=["hopper"], work=tmp_path, options=TINY, measured=FEW, progress=False)
-    run = lambda out, **more: calibration.compare(tmp_path / out, report=lines.append, **facts, **more)  # noqa: E731
+    facts: dict[str, Any] = dict(robots=["hopper"], tier="medium", work=tmp_path, options=TINY, progress=False)
+    run = lambda out, **more: run_study(  # noqa: E731
+        CalibrationStudy(FEW), tmp_path / out, report=lines.append, **facts, **more
+    )
     numbers = run("out/calibration.json")
     assert json.loads((tmp_path / "out/calibration.json").read_text()) == numbers
     table = pd.read_csv(tmp_path / "out/calibration.csv")
@@ -53,7 +55,7 @@ def test_models_are_measured_once_and_drawn(tmp_path: Path) -> None:
         assert 0.0 <= numbers[f"hopper.{model}.clipped"] < 1.0
         assert numbers[f"hopper.{model}.crps"] > 0.0 and f"hopper.{model}.nll" in numbers
     assert numbers["hopper.coverage_90"] == numbers["hopper.transformer.coverage_90"]
-    assert lines[0].startswith("hopper: 50 % intervals hold ")
+    assert lines[1].startswith("hopper: transformer: 50 % intervals hold ")
     with Image.open(tmp_path / "out/calibration.png") as figure:
         assert figure.size[0] > 1_200
     assert set(table["panel"]) == {"coverage", "errors", *(f"roc_{name}" for name in CONTRASTS)}
@@ -74,10 +76,9 @@ def test_models_are_measured_once_and_drawn(tmp_path: Path) -> None:
 
 
 def test_unknown_names_are_refused_before_any_work(tmp_path: Path) -> None:
+    facts: dict[str, Any] = dict(robots=["hopper"], work=tmp_path, options=TINY)
     with pytest.raises(UserError, match="hopper-meduim"):
-        calibration.compare(tmp_path / "c.json", robots=["hopper"], tier="meduim", work=tmp_path, options=TINY)
+        run_study(CalibrationStudy(), tmp_path / "c.json", tier="meduim", **facts)
     with pytest.raises(UserError, match="no/hopper is not a model folder"):
-        calibration.compare(
-            tmp_path / "c.json", robots=["hopper"], work=tmp_path, options=TINY, others={"mine": "no/{robot}"}
-        )
+        run_study(CalibrationStudy(), tmp_path / "c.json", tier="medium", others={"mine": "no/{robot}"}, **facts)
     assert list(tmp_path.iterdir()) == []

@@ -1,14 +1,10 @@
 """`envtf`: help, exit codes, one readable sentence, and the stages and Lightning's command lines behind it."""
 
-import json
-import os
 import re
-import shlex
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 
@@ -17,13 +13,10 @@ import pytest
 from envtf_lit.cli.command import parse_words
 from envtf_lit.cli.commands import COMMANDS, GROUPS
 from envtf_lit.cli.main import main
-from envtf_lit.cli.stages import STAGES, StageParser, split
-from envtf_lit.data.sources.files import load_dataset
+from envtf_lit.cli.stages import STAGES, split
 from envtf_lit.errors import UserError
-from envtf_lit.pipeline.yaml import dump_params, load_params, params_yaml, preset_params
 from envtf_lit.robots.tasks import ROBOTS
 from envtf_lit.zoo.train import RECIPES
-from tests.test_docs import PAGES, ROOT
 
 LIGHTNING = [name for name, command in COMMANDS.items() if command.module == "lightning"]
 OURS = [name for name in COMMANDS if name not in LIGHTNING]
@@ -36,16 +29,6 @@ def exit_status(arguments: list[str]) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     return 0
-
-
-@pytest.fixture(scope="module")
-def tiny_download(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A project in which `envtf download` has run."""
-    folder = tmp_path_factory.mktemp("project")
-    (folder / "params.yaml").write_text(params_yaml(preset_params("tiny")))
-    command = [sys.executable, "-m", "envtf_lit", "download", "--quiet", "--download.transitions", "1000"]
-    subprocess.run(command, cwd=folder, check=True, capture_output=True)
-    return folder
 
 
 @pytest.mark.parametrize("command", OURS)
@@ -79,37 +62,6 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
         assert verbs and [verb for verb in verbs if f"\n    {verb}" not in text] == []
 
 
-def documented() -> list[str]:
-    """What README and docs call `envtf` with: lines of code blocks, and code within sentences."""
-    found = list[str]()
-    for page in PAGES:
-        text = page.read_text()
-        found += re.findall(r"^ *envtf (.+)$", text, re.MULTILINE) + re.findall(r"`envtf ([^`\n]+)`", text)
-    return sorted(dict.fromkeys(found))
-
-
-def test_every_command_in_the_documentation_is_understood() -> None:
-    lines = documented()
-    assert len(lines) > 40
-    for line in lines:
-        words = shlex.split(line, comments=True)
-        if words[0].startswith("-"):
-            continue
-        name = " ".join(words[:2]) if words[0] in GROUPS else words[0]
-        assert name in COMMANDS, line
-        rest = words[len(name.split()) :]
-        if name in LIGHTNING:
-            cli = import_module("envtf_lit.cli.lightning").CLASSES[name][0]
-            assert not rest or rest[0] in (*cli.verbs, "--help"), line
-        elif name in STAGES:
-            own, overrides = split(rest)
-            StageParser(name).parse_args(own or ["cql"] * bool(STAGES[name].takes))
-            load_params(ROOT / "params.yaml", overrides)
-        elif rest and "--help" not in rest:
-            rest += ["--out", "x"] * (name in ("hidden", "horizon", "calibrate") and "--out" not in rest)
-            parse_words(import_module(f"envtf_lit.cli.{COMMANDS[name].module}").FUNCTIONS[name], name, rest)
-
-
 @pytest.mark.parametrize(
     ("arguments", "known"),
     [
@@ -133,7 +85,7 @@ def test_names_that_the_command_line_writes_out_itself_are_all_there_are(
     ("arguments", "absent"),
     [
         (["--help"], ["torch", "lightning", "jsonargparse", "numpy", "rich"]),
-        (["train_model", "--help"], ["torch", "lightning", "jsonargparse", "numpy"]),
+        (["zoo", "--help"], ["torch", "lightning", "jsonargparse", "numpy", "rich"]),
         *(([*command.split(), "--help"], ["torch", "lightning", "numpy"]) for command in ("horizon", "zoo build")),
     ],
 )
@@ -159,11 +111,15 @@ def test_help_imports_nothing_slow(arguments: list[str], absent: list[str]) -> N
         (["download", "--params", "nowhere.yaml"], "nowhere.yaml does not exist"),
         (["download", "--download.source=file", "--download.path=nowhere.h5"], "nowhere.h5"),
         (["download", "--task", "hoper-medium-replay"], "did you mean 'hopper-medium-replay'?"),
+        (["source", "--download.source=file", "--download.path=nowhere.h5"], "nowhere.h5, which is not a file"),
         (["train_model"], "data/dataset.h5"),
-        (["generate_rollouts"], "data/dataset.h5"),
+        (["train_model", "transfomer"], "no section 'transfomer' below train_model: did you mean 'transformer'?"),
+        (["train_model", "--train_model.updates", "9000"], "it is train_model.transformer.updates now"),
+        (["generate_rollouts"], "models/world_model/transformer"),
+        (["generate_rollouts", "none"], "no section 'none' below train_model"),
         (["train_policy", "cql"], "data/dataset.h5"),
-        (["train_policy", "etcql"], "Unknown algorithm 'etcql': did you mean 'et_cql'?"),
-        (["train_policy"], "required: ALGORITHM (see `envtf train_policy --help`)"),
+        (["train_policy", "etcql"], "no section 'etcql' below train_policy: did you mean 'et_cql'?"),
+        (["train_policy"], "train_policy has the sections bc, cql, et_cql: name one of them."),
         (["train_policy", "cql", "et_cql"], "'et_cql' is not an option"),
         (["trian_model"], "did you mean 'train_model'?"),
         (["data", "chekc"], "did you mean 'check'?"),
@@ -219,52 +175,6 @@ def test_an_interrupt_says_how_to_go_on(
     assert rerun in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_a_training_with_a_sentence(
-    number: int, tiny_download: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Lightning, which has handlers of its own, ends such a run with status 1 or 0."""
-    monkeypatch.chdir(tiny_download)
-    monkeypatch.setattr(
-        "lightning.pytorch.callbacks.Callback.on_train_batch_end", lambda *_: signal.raise_signal(number)
-    )
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    assert exit_status(["train_model", "--quiet"]) == 128 + number
-    assert capsys.readouterr().err.splitlines()[-1].startswith("envtf: Interrupted. The same command continues")
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-
-
-WAITING = """
-import concurrent.futures, multiprocessing, sys, time
-from envtf_lit.cli import main, project
-
-def doctor():
-    with concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        waiting = pool.submit(time.sleep, 60)
-        while not waiting.running():
-            time.sleep(0.01)
-        print("ready", flush=True)
-        waiting.result()
-
-if __name__ == "__main__":
-    project.FUNCTIONS["doctor"] = doctor
-    doctor.__doc__ = "Waits."
-    main.main(["doctor"])
-"""
-
-
-def test_a_pool_does_not_hold_up_a_termination(tmp_path: Path) -> None:
-    (tmp_path / "waiting.py").write_text(WAITING)
-    process = subprocess.Popen(
-        [sys.executable, "waiting.py"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None and process.stdout.readline() == "ready\n"
-    process.terminate()
-    _, errors = process.communicate(timeout=30)
-    assert process.returncode == 143
-    assert "envtf: Interrupted. The same command begins anew." in errors.splitlines()
-
-
 def test_flags_become_overrides() -> None:
     assert split(["--seed", "1", "--a.b=c=d", "--x", "-3"]) == ([], ["seed=1", "a.b=c=d", "x=-3"])
     assert split(["cql", "--seed", "1", "--params", "p.yaml", "--quiet"])[0] == ["cql", "--params", "p.yaml", "--quiet"]
@@ -311,93 +221,3 @@ def test_brackets_in_a_path_are_printed(tmp_path: Path, capsys: pytest.CaptureFi
     assert str(folder / "[red]my.h5") in capsys.readouterr().out
     assert exit_status(["data", "convert", str(folder / "[red]my.h5"), "x.npz"]) == 2
     assert f"envtf: {folder / '[red]my.h5'} is not a file" in capsys.readouterr().err
-
-
-def test_an_output_that_is_not_utf8_shows_stand_ins(tiny_download: Path) -> None:
-    shown = run(tiny_download, "data", "check", "data/dataset.h5", PYTHONIOENCODING="ascii")
-    assert "1,000 transitions" in shown and "?" in shown
-
-
-def test_params_prints_what_init_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_status(["params", "--preset", "tiny"]) == 0
-    printed = capsys.readouterr().out
-    assert exit_status(["init", str(tmp_path / "new"), "--preset", "tiny"]) == 0
-    assert (tmp_path / "new" / "params.yaml").read_text() == printed
-    assert dump_params(load_params(tmp_path / "new" / "params.yaml")) == dump_params(preset_params("tiny"))
-
-
-def test_init_leaves_an_existing_project_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "dvc.yaml").write_text("mine")
-    assert exit_status(["init", str(tmp_path)]) == 2
-    assert "exists already" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["dvc.yaml"]
-    assert (tmp_path / "dvc.yaml").read_text() == "mine"
-
-
-def test_doctor_reports_what_a_bug_report_needs(capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_status(["doctor"]) == 0
-    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
-    assert {"python", "torch", "mujoco", "cores", "device", "memory", "disk", "rendering"} <= lines.keys()
-    assert "missing" not in lines.values()
-
-
-def test_a_stage_writes_its_outputs_and_prints_its_metrics(tiny_download: Path) -> None:
-    dataset = load_dataset(tiny_download / "data" / "dataset.h5")
-    assert len(dataset) == 1000
-    assert json.loads((tiny_download / "data" / "dataset.json").read_text())["transitions"] == 1000
-
-
-@pytest.mark.parametrize("kind", LIGHTNING)
-def test_lightnings_help_says_that_a_config_is_trusted(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_status([kind, "--help"]) == 0
-    assert "trusted like code" in " ".join(capsys.readouterr().out.split())
-
-
-def test_lightnings_command_lines_refuse_bad_input_alike(project: Path) -> None:
-    output = run(project, "model", "fit", "--data.path", "nowhere.h5", expected=2)
-    assert "envtf: nowhere.h5" in output.splitlines()[-1]
-    assert "Traceback" not in output
-
-
-FULL_DISK = """
-import resource, sys
-from envtf_lit.cli.lightning import run
-from envtf_lit.cli.main import main
-
-resource.setrlimit(resource.RLIMIT_FSIZE, (4_000, 4_000))  # every larger file fails as on a full disk
-main(sys.argv[1:])
-"""
-
-
-def test_a_disk_that_is_full_of_checkpoints_is_said_in_a_sentence(tiny_download: Path, tmp_path: Path) -> None:
-    pytest.importorskip("resource")
-    sizes = {"model.layers": 1, "model.width": 16, "model.context": 4, "updates_per_epoch": 2, "updates": 2}
-    options = [f"--model.options.{key}={value}" for key, value in sizes.items()]
-    fit = ["model", "fit", "--data.path", str(tiny_download / "data/dataset.h5"), "--trainer.logger=false", *options]
-    output = run(tmp_path, *fit, program=["-c", FULL_DISK], expected=2)
-    assert output.splitlines()[-1].startswith("envtf: No space left on the disk")
-    assert not list(tmp_path.rglob("*.ckpt")) and not list(tmp_path.rglob("published"))
-
-
-def test_a_rendering_back_end_that_is_not_there_stops_neither_stage_nor_doctor(project: Path) -> None:
-    run(project, "download", "--quiet", "--download.transitions=1000", MUJOCO_GL="osmesa")
-    assert (project / "data/dataset.h5").exists()
-    report = run(project, "doctor", MUJOCO_GL="glut")  # none of MuJoCo's: nowhere installed
-    assert "MUJOCO_GL        glut" in report and "rendering " in report
-
-
-def run(
-    folder: Path, *arguments: str, expected: int = 0, program: Sequence[str] = ("-m", "envtf_lit"), **variables: str
-) -> str:
-    """Runs `envtf` in a process of its own and returns all that it printed."""
-    result = subprocess.run(
-        [sys.executable, *program, *arguments],
-        cwd=folder,
-        env=os.environ | variables,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == expected, result.stdout
-    return result.stdout

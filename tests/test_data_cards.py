@@ -80,3 +80,12 @@ def test_minaris_returns_get_no_score() -> None:
     card = dataset_card(recorded(), "minari", {})
     assert "scores" not in card
     assert card["returns"]["max"] == 1000
+
+
+def test_limits_and_held_out_episodes_are_in_the_card() -> None:
+    card = dataset_card(recorded().with_split(0.5, seed=0), "file", {})
+    assert (card["action_low"], card["action_high"]) == ([-1.0] * 3, [1.0] * 3)
+    assert card["held_out_episodes"] == 2
+    assert "held_out_episodes" not in dataset_card(recorded(), "file", {})
+    origin = dict(env_kwargs={}, seed=0, actions="stochastic", trained_with="", versions={}, policies=[], note="")
+    assert "| actions | stochastic, in [-1, 1] |" in card_page(dataset_card(recorded(), "zoo", origin))

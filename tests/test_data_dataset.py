@@ -59,6 +59,21 @@ def test_split_partitions_the_episodes(share: float, held: int):
     assert all(np.array_equal(getattr(test, name), getattr(again, name)) for name in COLUMNS)
 
 
+def test_a_split_is_kept_and_spent():
+    dataset = make([2, 3, 4, 5, 6]).with_split(0.4, seed=3)
+    assert dataset.held_out is not None and dataset.held_out.sum() == 2
+    for one, two in zip(dataset.split(), make([2, 3, 4, 5, 6]).split(0.4, seed=3), strict=True):
+        assert np.array_equal(one.rewards, two.rewards) and one.held_out is None
+    assert np.array_equal(dataset.split(0.9, seed=1)[1].rewards, dataset.split()[1].rewards)
+    order = np.random.default_rng(3).permutation(5)
+    assert np.flatnonzero(dataset.held_out).tolist() == sorted(order[:2])
+
+
+def test_a_dataset_without_a_split_says_so():
+    with pytest.raises(UserError, match="give it a split"):
+        make([2, 3]).split()
+
+
 def test_split_needs_two_episodes():
     with pytest.raises(UserError, match="one episode"):
         make([4]).split(0.5, seed=0)

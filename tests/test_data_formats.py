@@ -1,9 +1,12 @@
 """Files: round trips, D4RL's variants, and what stays on a full disk."""
 
 import resource
+import subprocess
+import sys
 import time
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from logs import assert_equal, columns, write
@@ -110,6 +113,48 @@ def test_stored_action_limits_are_used(tmp_path: Path, ending: str):
     dataset = load_dataset(write(tmp_path / f"in{ending}", content))
     assert dataset.action_low.tolist() == [-2] * 3
     assert dataset.action_high.tolist() == [3] * 3
+
+
+PLACES = ["action_low", "action_space/low", "action_space_low", "metadata/action_low", "metadata/action_space/low"]
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("kind", [".npz", "array", "attribute"])
+def test_action_limits_are_found_wherever_they_are(tmp_path: Path, kind: str, place: str):
+    content, path = columns(), tmp_path / ("in.npz" if kind == ".npz" else "in.h5")
+    content["actions"] *= np.float32(0.4)
+    limits = {place: np.full(3, -0.5), place.replace("low", "high"): np.full(3, 0.5)}
+    write(path, content | limits if kind == ".npz" else content)
+    if kind != ".npz":
+        with h5py.File(path, "r+") as file:
+            for name, values in limits.items():
+                group, _, leaf = name.rpartition("/")
+                within = file.require_group(group or "/")
+                (within.attrs if kind == "attribute" else within)[leaf] = values
+    dataset = load_dataset(path)
+    assert dataset.action_low.tolist() == [-0.5] * 3
+    assert dataset.action_high.tolist() == [0.5] * 3
+
+
+def test_limits_that_disagree_are_refused(tmp_path: Path, ending: str):
+    content = columns() | {"action_space/low": -np.ones(3), "action_space/high": np.ones(3)}
+    stated = {"action_low": -2 * np.ones(3), "action_high": np.ones(3)}
+    with pytest.raises(UserError, match=r"'action_low' is \[-2. -2. -2.\] at 'action_low' and \[-1. -1. -1.\] at"):
+        load_dataset(write(tmp_path / f"in{ending}", content | stated))
+
+
+def test_a_split_is_stored(tmp_path: Path, ending: str):
+    dataset = load_dataset(write(tmp_path / f"in{ending}", columns())).with_split(0.3, seed=0)
+    save_dataset(dataset, tmp_path / f"out{ending}")
+    assert_equal(load_dataset(tmp_path / f"out{ending}"), dataset)
+
+
+def test_a_file_that_another_program_writes_is_no_damaged_one(tmp_path: Path):
+    path = write(tmp_path / "in.h5", columns())
+    read = f"from envtf_lit.data.sources.files import load_dataset as load\nload({str(path)!r})"
+    with h5py.File(path, "r+"):
+        found = subprocess.run([sys.executable, "-c", read], capture_output=True, text=True, check=False)
+    assert "is open for writing in another program: close it there" in found.stderr
 
 
 def test_missing_file_folder_and_ending(tmp_path: Path, ending: str):

@@ -75,8 +75,8 @@ def test_constant_dimensions_and_rewards():
     text = said(
         dataset, observations=observations, next_observations=observations, actions=actions, rewards=np.ones(240)
     )
-    assert "note: 2 of 11 dimensions of 'observations' are constant (2, 5)" in text
-    assert "warning: 1 of 3 dimensions of 'actions' are constant (1)" in text
+    assert "note: 2 of 11 dimensions of 'observations' are constant in float32 (2, 5)" in text
+    assert "warning: 1 of 3 dimensions of 'actions' are constant in float32 (1)" in text
     assert "every reward is 1" in text
 
 
@@ -190,6 +190,31 @@ def test_convert_counts_the_episodes_that_minari_cannot_hold(tmp_path: Path):
     assert len(again.episode_starts) == 12
     for name in ("observations", "actions", "rewards", "next_observations", "terminated"):
         assert np.array_equal(getattr(again, name), getattr(dataset, name))
+
+
+def test_convert_states_the_limits_that_a_file_does_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    content = columns()
+    content["actions"] *= np.float32(0.3)
+    source, target = write(tmp_path / "in.h5", content), tmp_path / "out.h5"
+    with pytest.raises(SystemExit):
+        main(["data", "convert", str(source), str(target)])
+    assert "state the robot's own" in capsys.readouterr().err and not target.exists()
+    main(["data", "convert", str(source), str(target), "--action-low", "-0.4", "--action-high", "0.4", "0.5", "0.4"])
+    dataset = load_dataset(target)
+    assert dataset.action_low.tolist() == [np.float32(-0.4)] * 3
+    assert dataset.action_high.tolist() == np.array([0.4, 0.5, 0.4], np.float32).tolist()
+
+
+@pytest.mark.usefixtures("minari_root")
+def test_convert_keeps_the_split_or_says_that_it_does_not(tmp_path: Path):
+    dataset = walker_dataset().with_split(0.2, seed=0)
+    save_dataset(dataset, tmp_path / "in.h5")
+    kept, findings = convert(str(tmp_path / "in.h5"), str(tmp_path / "out.npz"))
+    assert_equal(load_dataset(tmp_path / "out.npz"), dataset)
+    assert_equal(kept, dataset)
+    assert not findings
+    _, findings = convert(str(tmp_path / "in.h5"), "minari:walker-v0")
+    assert "which episodes are held out is left behind" in "; ".join(map(str, findings))
 
 
 def test_convert_says_what_it_changes_and_leaves_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -226,7 +226,7 @@ def damage(data: Path, how: str) -> None:
         ("external link", "under /episode_1/rewards what leads elsewhere"),
         ("absurd size", "fills the memory"),
         ("short rewards", "T steps need"),
-        ("texts", "damaged"),
+        ("texts", "store plain numbers"),
     ],
 )
 def test_damaged_sets_are_refused_with_a_sentence(minari_root: Path, how: str, message: str) -> None:

@@ -8,17 +8,22 @@ import pytest
 from logs import Columns
 from logs import columns as file_columns
 
-from envtf_lit.data.checks import Finding, build_dataset, examine
+from envtf_lit.data.checks import build_dataset, examine
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.findings import Finding
 from envtf_lit.errors import UserError
 
-ATTRIBUTES = ("task", "action_low", "action_high")
+ATTRIBUTES = ("task", "action_low", "action_high", "held_out")
 
 
 def columns(*dims: int) -> Columns:
     """By our names rather than D4RL's."""
     content = file_columns(*dims)
     return content | {"terminated": content.pop("terminals"), "truncated": content.pop("timeouts")}
+
+
+def limits(low: Any, high: Any) -> Callable[[Columns], None]:
+    return lambda content: content.update(action_low=low, action_high=high)
 
 
 def find(content: Columns, task: str | None = None) -> tuple[OfflineDataset | None, list[Finding]]:
@@ -77,12 +82,22 @@ BAD = {
     "flag": (change("terminated", lambda x: x + 2), "'terminated' is 2 at row 0 (12 rows in all): flags must be 0"),
     "nan flag": (put("truncated", np.full(12, np.nan)), "'truncated' is nan at row 0"),
     "text": (put("rewards", np.array(["a"] * 12)), "'rewards' holds <U1 values: store plain numbers"),
-    "action": (at("actions", (4, 1), 1.5), "to 1.5, outside the action space [-1, 1], first at row 4: rescale them"),
+    "action": (at("actions", (4, 1), 1.5), "[-1, 1] in 8.3% of the rows, first at row 4: clip them (np.clip), if"),
     "zero rows": (change("rewards", lambda x: x[:0]), "which is empty"),
-    "action limits": (put("action_low", np.full(3, 2.0)), "is not below"),
-    "infinite limits": (put("action_low", np.full(3, -1e300)), "is not below"),
-    "action limit shape": (put("action_low", np.full(2, -1.0)), "must be 3 finite numbers"),
-    "action limit type": (put("action_high", "high"), "must be 3 finite numbers"),
+    "action limits": (limits(np.full(3, 2.0), np.ones(3)), "is not below"),
+    "infinite limits": (limits(np.full(3, -1e300), np.ones(3)), "is not below"),
+    "action limit shape": (limits(np.full(2, -1.0), np.ones(3)), "must be 3 finite numbers"),
+    "action limit type": (limits(-np.ones(3), "high"), "must be 3 finite numbers"),
+    "half the limits": (put("action_high", 1.0), "there is 'action_high' and no 'action_low': store both"),
+    "small actions": (
+        change("actions", lambda x: 0.4 * x),
+        "reach from -0.4 to 0.4 in dimension 0, which does not",
+    ),
+    "one small action": (change("actions", lambda x: x * np.array([1, 1, 0.5])), "-0.5 to 0.5 in dimension 2, which"),
+    "actions of one sign": (change("actions", np.abs), "does not fill the usual [-1, 1]: state the robot's own"),
+    "split by rows": (put("held_out", np.ones(12)), "'held_out' has shape (12,), and there are 3 episodes: store for"),
+    "nothing held out": (put("held_out", np.zeros(3)), "'held_out' has shape (3,), and there are 3 episodes"),
+    "odd split": (put("held_out", np.array([0, 1, 2])), "store for each episode 1 if it is held out"),
     "flag inside": (
         indexed(*[0] * 7, *[1] * 5),
         "an episode ends at row 3 by its flags and goes on by 'episode_index'",
@@ -122,9 +137,9 @@ def test_all_errors_come_at_once_and_the_first_is_the_sentence_of_loading():
     for case in ("no timeouts", "short", "nan", "action limit shape"):
         BAD[case][0](content)
     assert len(errors(content)) == 4
-    low = content.pop("action_low")
+    low, high = content.pop("action_low"), content.pop("action_high")
     with pytest.raises(UserError, match=r"^my.h5: there is no 'truncated'[^\n]*\.$"):
-        build_dataset(content, {"action_low": low}, task=None, source="my.h5")
+        build_dataset(content, {"action_low": low, "action_high": high}, task=None, source="my.h5")
 
 
 @pytest.mark.parametrize(
@@ -219,3 +234,59 @@ def test_the_arrays_given_stay_as_they_are():
     assert dataset is not None
     assert np.max(dataset.actions) == 1
     assert all(np.array_equal(content[name], before[name]) for name in before)
+
+
+def warnings(content: Columns) -> list[str]:
+    return [str(finding) for finding in find(content)[1] if finding.kind == "warning"]
+
+
+def test_actions_need_not_fill_the_limits_that_are_stated_or_the_robots():
+    content = columns()
+    content["actions"] *= np.float32(0.3)
+    assert not errors(content | {"action_low": -1.0, "action_high": 1.0})
+    assert not errors(content, task="hopper-medium")
+    dataset, _ = find(content | {"action_low": -0.4, "action_high": np.array([0.4])})
+    assert dataset is not None and dataset.action_high.tolist() == [np.float32(0.4)] * 3
+
+
+def test_rounding_beyond_the_limits_is_beside_the_limits_own_size():
+    content, unit = columns(), 1e-9
+    content["actions"] *= np.float32(unit)
+    limit = {"action_low": -unit, "action_high": unit}
+    content["actions"][3, 0] = unit * 1.000005
+    dataset, _ = find(content | limit)
+    assert dataset is not None and np.max(np.asarray(dataset.actions)) == np.float32(unit)
+    content["actions"][3, 0] = unit * 1.01
+    assert "outside the action space" in errors(content | limit)[0]
+
+
+def test_numbered_choices_are_told_from_quantities():
+    content = columns(11, 1)
+    content["actions"] = np.arange(12)[:, None] % 3 - 1
+    (found,) = warnings(content)
+    assert found.startswith("all actions are whole numbers (-1, 0, 1): if they number choices, take another method")
+    content["actions"] = content["actions"] * 0.99
+    assert not warnings(content)
+
+
+@pytest.mark.parametrize(("offset", "lost"), [(0.0, False), (1e3, False), (3e7, True), (1.7e9, True)])
+def test_detail_that_float32_loses_is_told(offset: float, lost: bool):
+    content = columns(3)
+    for name in ("observations", "next_observations"):
+        content[name] = content[name].astype(np.float64)
+        content[name][:, 1] += offset
+        content[name][:, 2] = 0.1 + 0.2 + np.arange(12) % 2 * 1e-16  # rounding, not detail
+    content["rewards"] = content["rewards"].astype(np.float64) + offset
+    found = warnings(content)
+    assert len(found) == 3 * lost
+    beginnings = ("'observations' varies in dimension 1 by ", "'rewards' varies by ", "'next_observations' varies in ")
+    for text, beginning in zip(found, beginnings if lost else (), strict=True):
+        assert text.startswith(beginning) and "float32 keeps next to nothing: subtract an offset" in text
+
+
+def test_the_split_of_a_file_survives_the_loss_of_its_last_rows():
+    content = columns() | {"held_out": np.array([0, 1, 1]), "episode_index": np.repeat([0, 1, 2], [4, 1, 7])}
+    del content["next_observations"], content["terminated"], content["truncated"]
+    dataset, _ = find(content)
+    assert dataset is not None and dataset.held_out is not None
+    assert dataset.held_out.tolist() == [False, True]

@@ -26,7 +26,11 @@ ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 # modules that need more than the library's own dependencies
-NEED = {"envtf_lit/figures/notebook.py": "pipeline", "envtf_lit/zoo/train.py": "behaviour"}
+NEED = {
+    "envtf_lit/figures/notebook.py": "pipeline",
+    "envtf_lit/figures/report.py": "pipeline",
+    "envtf_lit/zoo/train.py": "behaviour",
+}
 IMPORTED_AS = {"pillow": "PIL", "ipython": "IPython", "ruamel.yaml": "ruamel", "sbx-rl": "sbx"}
 NOT_IMPORTED = {
     "dvc": "runs dvc.yaml",
@@ -168,7 +172,7 @@ def test_init_says_how_to_get_dvc(
 ) -> None:
     main(["init", str(tmp_path / "with")])
     assert "pip install" not in capsys.readouterr().out
-    monkeypatch.setattr("envtf_lit.cli.main.find_spec", lambda name: None)
+    monkeypatch.setattr("envtf_lit.cli.project.find_spec", lambda name: None)
     main(["init", str(tmp_path / "without")])
     assert "Next: pip install 'envtf-lit[pipeline]' && cd" in capsys.readouterr().out
 

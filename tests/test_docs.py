@@ -1,9 +1,18 @@
-"""The pages in docs/: their links hold, and a reader who begins at the README can come to each."""
+"""The pages in docs/: their links hold, a reader comes to each from the README, and what they suggest can be done."""
 
+import json
 import re
+import shlex
+from collections.abc import Iterator
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
+from ruamel.yaml import YAML
+
+from envtf_lit.pipeline.yaml import dump_params, load_params
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -43,3 +52,98 @@ def test_every_page_is_reached_from_the_readme() -> None:
 def test_the_index_names_every_page_beside_it() -> None:
     listed = {path for path, _ in links(DOCS / "README.md")}
     assert {page for page in DOCS.glob("*.md") if page.name != "README.md"} - listed == set()
+
+
+def test_the_readme_has_a_line_for_every_room_of_the_package() -> None:
+    named = re.findall(r"^  (\w+)/ +\w", (ROOT / "README.md").read_text(), re.MULTILINE)
+    rooms = {path.parent.name for path in (ROOT / "envtf_lit").glob("*/__init__.py")}
+    assert len(named) == len(set(named))
+    assert set(named) == rooms
+
+
+# What pages and notebooks suggest to write into params.yaml, or to put behind `-S` or `--`. The log tells of the past.
+
+SOURCES = [page for page in PAGES if DOCS / "log" not in page.parents] + sorted((ROOT / "notebooks").glob("*.ipynb"))
+SECTION = r"(?:download|train_model|generate_rollouts|policy|train_policy|evaluate)"
+ASSIGNED = re.compile(rf"({SECTION}(?:\.\w+)*|seed|threads|precision|compile)(?:: |=)(\S.*)")
+FLAG = re.compile(rf"(--)?({SECTION}(?:\.\w+)+)(?:=(\S.*))?")
+
+
+def prose(path: Path) -> str:
+    """A page's text; a notebook's markdown."""
+    if path.suffix == ".md":
+        return path.read_text()
+    cells = json.loads(path.read_text())["cells"]
+    return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+
+
+def suggestions(text: str) -> Iterator[list[str]]:
+    """Overrides `section.key=value`; those of one sentence's paragraph or list item, block or line belong together."""
+    fence = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+    for language, block in fence.findall(text):
+        if language == "yaml":
+            tree = YAML(typ="safe", pure=True).load(block)
+            yield [f"{key}={json.dumps(value)}" for key, value in tree.items()]
+        else:
+            yield from map(flags, re.sub(r"\\\n", "", block).splitlines())
+    for item in re.split(r"\n\s*\n|\n(?=\s*(?:[-*|]|\d+\.) )", fence.sub("", text)):
+        spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", item)]
+        found = [f"{match[1]}={match[2]}" for span in spans if (match := ASSIGNED.fullmatch(span))]
+        yield found + [flag for span in spans if not ASSIGNED.fullmatch(span) for flag in flags(span)]
+
+
+def flags(line: str) -> list[str]:
+    """What a command has behind `-S` or `--`."""
+    try:
+        words = shlex.split(line, comments=True)
+    except ValueError:  # prose, or another language
+        return []
+    matches = [(match, after) for word, after in pairwise([*words, ""]) if (match := FLAG.fullmatch(word))]
+    return [f"{match[2]}={match[3] or after}" for match, after in matches if match[3] or (match[1] and after)]
+
+
+CASES = [(path, found) for path in SOURCES for found in suggestions(prose(path)) if found]
+
+
+def leaves(values: Any, key: str) -> Iterator[tuple[str, Any]]:
+    if not isinstance(values, dict):
+        yield key, values
+        return
+    for name, item in values.items():
+        yield from leaves(item, f"{key}.{name}")
+
+
+@cache
+def standing() -> dict[str, Any]:
+    """What the repository's params.yaml says, by keys."""
+    tree = dump_params(load_params(ROOT / "params.yaml"))
+    return {key: value for name, item in tree.items() for key, value in leaves(item, name)}
+
+
+@pytest.mark.parametrize(
+    ("path", "overrides"), CASES, ids=[f"{path.name}: {', '.join(found)}" for path, found in CASES]
+)
+def test_what_is_suggested_is_accepted_and_changes_something(path: Path, overrides: list[str]) -> None:
+    load_params(ROOT / "params.yaml", overrides)
+    for override in overrides:
+        key, _, text = override.partition("=")
+        assert [k for k, v in leaves(YAML(typ="safe", pure=True).load(text), key) if standing().get(k, ...) == v] == []
+
+
+def test_suggestions_are_found_in_every_form() -> None:
+    text = (
+        "Try `train_policy.cql.cql_weight: 1`,\nor `policy.updates=9000`.\n\n1. `train_model.transformer.width: 8`\n"
+        "2. `envtf evaluate --evaluate.episodes 3`\n\n```bash\ndvc exp run -S seed=1 -S policy.n_step=2  # x\n```\n"
+        "`download: {source: file}`, `models/policy/x`, `policy.updates` and `--data.path=x`\n"
+        "```yaml\ntrain_policy:\n  x: {algorithm: cql}\n```\n"
+    )
+    assert [*filter(None, suggestions(text))] == [
+        ["policy.n_step=2"],
+        ['train_policy={"x": {"algorithm": "cql"}}'],
+        ["train_policy.cql.cql_weight=1", "policy.updates=9000"],
+        ["train_model.transformer.width=8"],
+        ["evaluate.episodes=3"],
+        ["download={source: file}"],
+    ]
+    for name, least in (("README.md", 5), ("datasets.md", 4), ("report.ipynb", 3)):
+        assert sum(len(found) for path, found in CASES if path.name == name) >= least, name

@@ -38,8 +38,8 @@ def data():
 
 def covered(data, level: float, **options) -> float:
     trajectories = whole_episodes(data, 6, seed=0)
-    teacher_forced = forecast(linear_world(**options), trajectories, feedback="recorded")
-    return coverage(teacher_forced, trajectories, Scale.of(data), level).mean
+    forced = forecast(linear_world(**options), trajectories, feedback="recorded")
+    return coverage(forced, trajectories, Scale.of(data), level).mean
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9])
@@ -59,8 +59,8 @@ def test_overconfident_and_timid_spreads_show(data):
 
 def test_constant_dimensions_are_left_out(data):
     trajectories = whole_episodes(data, 6, seed=0)
-    teacher_forced = forecast(linear_world(std=NOISE), trajectories, feedback="recorded")
-    result = coverage(teacher_forced, trajectories, Scale.of(data), 0.9)
+    forced = forecast(linear_world(std=NOISE), trajectories, feedback="recorded")
+    result = coverage(forced, trajectories, Scale.of(data), 0.9)
     assert [value is None for value in result.by_dimension] == [False, False, True, False]
     live = [value for value in result.by_dimension if value is not None]
     assert result.mean == pytest.approx(sum(live) / 3)
@@ -68,8 +68,8 @@ def test_constant_dimensions_are_left_out(data):
 
 def scores(data, **options) -> ProperScores:
     trajectories = whole_episodes(data, 6, seed=0)
-    teacher_forced = forecast(linear_world(**options), trajectories, feedback="recorded")
-    return proper_scores(teacher_forced, trajectories, Scale.of(data))
+    forced = forecast(linear_world(**options), trajectories, feedback="recorded")
+    return proper_scores(forced, trajectories, Scale.of(data))
 
 
 def test_honest_spreads_have_the_scores_of_gaussians(data):
@@ -85,30 +85,29 @@ def test_honest_spreads_have_the_scores_of_gaussians(data):
 def test_the_ranked_score_is_the_integral_that_it_stands_for():
     data = linear_data((1, 1, 1, 1))
     trajectories, scale = whole_episodes(data, 4, seed=0), Scale.of(data)
-    teacher_forced = forecast(linear_world(error=0.5, std=0.2), trajectories, feedback="recorded")
+    forced = forecast(linear_world(error=0.5, std=0.2), trajectories, feedback="recorded")
     grid, expected = np.linspace(-40.0, 40.0, 400_001), []
     for column in np.flatnonzero(scale.live.numpy()):
         mean, std = (
-            value[:, 0, column].double().numpy() / float(scale.std[column])
-            for value in (teacher_forced.mean, teacher_forced.std)
+            value[:, 0, column].double().numpy() / float(scale.std[column]) for value in (forced.mean, forced.std)
         )
         recorded = trajectories.targets[:, 0, column].double().numpy() / float(scale.std[column])
         for m, s, y in zip(mean, std, recorded, strict=True):
             below = 0.5 * torch.erfc(torch.from_numpy((m - grid) / s / np.sqrt(2.0))).numpy()
             expected.append(np.trapezoid(np.square(below - (grid >= y)), grid))
-    assert proper_scores(teacher_forced, trajectories, scale).crps == pytest.approx(np.mean(expected), rel=1e-3)
+    assert proper_scores(forced, trajectories, scale).crps == pytest.approx(np.mean(expected), rel=1e-3)
 
 
 def test_recalibration_mends_a_wrong_spread_and_leaves_a_fitted_one():
     halves = [whole_episodes(linear_data((300,) * 6, noise=NOISE, seed=seed), 6, seed=0) for seed in (1, 2)]
     timid = linear_world(std=3 * NOISE)
-    seen, teacher_forced = (forecast(timid, half, feedback="recorded") for half in halves)
+    seen, forced = (forecast(timid, half, feedback="recorded") for half in halves)
     scale = Scale.of(linear_data((300,) * 6, noise=NOISE))
-    mended = recalibrated(teacher_forced, seen, halves[0])
-    assert coverage(teacher_forced, halves[1], scale, 0.5).mean > 0.9
+    mended = recalibrated(forced, seen, halves[0])
+    assert coverage(forced, halves[1], scale, 0.5).mean > 0.9
     for level in (0.5, 0.9):
         assert coverage(mended, halves[1], scale, level).mean == pytest.approx(level, abs=0.03)
-    before, after = (proper_scores(run, halves[1], scale) for run in (teacher_forced, mended))
+    before, after = (proper_scores(run, halves[1], scale) for run in (forced, mended))
     assert after.nll < before.nll and after.crps < before.crps
     seen_mended = recalibrated(seen, seen, halves[0])
     again = recalibrated(mended, seen_mended, halves[0])
@@ -130,13 +129,13 @@ def test_certain_and_infinite_forecasts_have_finite_scores(data):
 def test_exact_predictions_without_spread_have_no_residual():
     data = linear_data((10,))
     trajectories = whole_episodes(data, 1, seed=0)
-    teacher_forced = forecast(linear_world(std=0.0), trajectories, feedback="recorded")
-    residuals = normal_scores(teacher_forced, trajectories)
+    forced = forecast(linear_world(std=0.0), trajectories, feedback="recorded")
+    residuals = normal_scores(forced, trajectories)
     assert bool((residuals[:, 2] == 0.0).all())
     assert not bool(torch.isnan(residuals).any())
 
 
-# strange pairs against familiar ones
+# out-of-distribution pairs against in-distribution ones
 
 
 def test_the_area_counts_pairs_in_the_right_order():
@@ -149,11 +148,11 @@ def test_the_area_counts_pairs_in_the_right_order():
 
 def test_the_curve_has_the_area():
     rng = np.random.default_rng(0)
-    familiar, strange = rng.normal(size=5_000), rng.normal(1.0, size=4_000)
-    false, true = roc_curve(familiar, strange)
+    inside, outside = rng.normal(size=5_000), rng.normal(1.0, size=4_000)
+    false, true = roc_curve(inside, outside)
     assert (false[0], false[-1], true[-1]) == (0.0, 1.0, 1.0)
     assert (np.diff(true) >= 0).all()
-    assert np.trapezoid(true, false) == pytest.approx(auroc(familiar, strange), abs=2e-3)
+    assert np.trapezoid(true, false) == pytest.approx(auroc(inside, outside), abs=2e-3)
 
 
 def test_rank_correlation_by_hand():
@@ -189,10 +188,10 @@ def test_points_are_late_pairs_with_the_steps_before_them():
     log = random_log((12, 8, 15))  # two late rows, none, and five
     points = draw_points(log, 100, history=3, seed=0)
     rows = [10, 11, 30, 31, 32, 33, 34]
-    assert points.lengths.tolist() == [4] * 7
+    assert points.histories.lengths.tolist() == [4] * 7
     for i, row in enumerate(rows):
-        np.testing.assert_array_equal(points.observations[i], log.observations[row - 3 : row + 1])
-        np.testing.assert_array_equal(points.past_actions[i], log.actions[row - 3 : row])
+        np.testing.assert_array_equal(points.histories.observations[i], log.observations[row - 3 : row + 1])
+        np.testing.assert_array_equal(points.histories.actions[i], log.actions[row - 3 : row])
         np.testing.assert_array_equal(points.actions[i], log.actions[row])
     assert len(draw_points(log, 4, history=3, seed=0).actions) == 4
     with pytest.raises(UserError, match="No episode has more than 10 steps"):
@@ -203,7 +202,9 @@ def test_uniform_actions_replace_the_last_action_alone():
     log = random_log((60, 60))
     points = draw_points(log, 100, history=3, seed=0)
     other = with_uniform_actions(points, log.action_low, log.action_high, seed=0)
-    assert torch.equal(other.observations, points.observations) and torch.equal(other.past_actions, points.past_actions)
+    assert torch.equal(other.histories.observations, points.histories.observations) and torch.equal(
+        other.histories.actions, points.histories.actions
+    )
     assert other.actions.dtype == torch.float32
     assert -2 <= other.actions.min() < -1.8 and 2.8 < other.actions.max() <= 3
     assert not torch.isclose(other.actions, points.actions).any()
@@ -215,9 +216,9 @@ def test_novelty_is_that_of_the_last_token_after_the_true_past():
     points = draw_points(log, 7, history=5, seed=0)  # the model's context is 6
     assert model.laplace is not None and model.random_features is not None
     with torch.no_grad():
-        actions = torch.cat([points.past_actions, points.actions[:, None]], 1)
-        hidden, _ = model.encode(points.observations, actions, cached=False)
-        random = model.random_features(model.normaliser.token(points.observations[:, -1], points.actions))
+        actions = torch.cat([points.histories.actions, points.actions[:, None]], 1)
+        hidden, _ = model.encode(points.histories.observations, actions, cached=False)
+        random = model.random_features(model.normaliser.token(points.histories.observations[:, -1], points.actions))
         expected = model.laplace.leverage(torch.cat([hidden[:, -1], random], -1)) / model.laplace.limit
     found = novelties(model, points, batch_size=3)
     assert found is not None
@@ -263,7 +264,7 @@ def test_errors_are_those_of_each_step_from_the_imagined_state():
     data, model = linear_data((40, 40)), linear_world(error=0.05, std=0.3)
     starts, scale = draw_points(data, 6, history=2, seed=0), Scale.of(data)
     run = rollout_errors(model, Still(), starts, TrueWorld(linear_world()), scale, steps=4)  # pyright: ignore
-    state, expected = starts.observations[torch.arange(6), starts.lengths - 1], []
+    state, expected = starts.histories.present, []
     first = state[:, 0]
     for _ in range(4):
         imagined, true = state @ model.matrix.T, state @ linear_world().matrix.T
@@ -278,7 +279,7 @@ def test_errors_are_those_of_each_step_from_the_imagined_state():
 def test_what_the_simulator_cannot_take_is_left_out_and_counted():
     data = linear_data((40, 40))
     starts, scale = draw_points(data, 10, history=2, seed=0), Scale.of(data)
-    states = starts.observations[torch.arange(10), starts.lengths - 1].abs().amax(1)
+    states = starts.histories.present.abs().amax(1)
     physics = TrueWorld(linear_world(), limit=float(states.median()))
     run = rollout_errors(linear_world(), Still(), starts, physics, scale, steps=1)  # pyright: ignore
     assert len(run.error) == len(run.uncertainty) == 5
@@ -289,7 +290,7 @@ def test_what_the_simulator_cannot_take_is_left_out_and_counted():
 def test_states_whose_velocity_was_clipped_are_left_out_and_counted():
     data = linear_data((40, 40))
     starts, scale = draw_points(data, 10, history=2, seed=0), Scale.of(data)
-    states = starts.observations[torch.arange(10), starts.lengths - 1].abs().amax(1).sort().values
+    states = starts.histories.present.abs().amax(1).sort().values
     physics = TrueWorld(linear_world(), limit=float(states[7]), clip=float(states[5]))
     run = rollout_errors(linear_world(), Still(), starts, physics, scale, steps=1)  # pyright: ignore
     assert len(run.error) == 5

@@ -11,8 +11,9 @@ import pytest
 from PIL import Image
 
 from envtf_lit.errors import UserError
-from envtf_lit.studies import memory as hidden
-from envtf_lit.studies.memory import HiddenOptions
+from envtf_lit.studies import memory, study
+from envtf_lit.studies.memory import HiddenOptions, MemoryStudy
+from envtf_lit.studies.study import run_study
 from envtf_lit.studies.suite import MODELS, Suite, SuiteOptions, build_suite
 from envtf_lit.world_models.options import EnsembleOptions
 
@@ -24,16 +25,15 @@ TINY = SuiteOptions(transitions=1_000, updates=2, context=20, ensemble=ENSEMBLE,
 
 def test_models_are_measured_on_draws_that_none_has_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lines = list[str]()
-    facts: dict[str, Any] = dict(
-        tier="medium", work=tmp_path, options=TINY, measured=HiddenOptions(1_000, 20), progress=False
-    )
-    metrics = hidden.compare(tmp_path / "out/hidden.json", robots=["hopper"], report=lines.append, **facts)
+    facts: dict[str, Any] = dict(tier="medium", work=tmp_path, options=TINY, progress=False, report=lines.append)
+    hidden = MemoryStudy(HiddenOptions(1_000, 20))
+    metrics = run_study(hidden, tmp_path / "out/hidden.json", robots=["hopper"], **facts)
     assert json.loads((tmp_path / "out/hidden.json").read_text()) == metrics
     for name in MODELS:
         assert len(metrics[f"hopper.{name}.one_step_by_context"]) == 32
         assert metrics[f"hopper.{name}.one_step"] == metrics[f"hopper.{name}.one_step_by_context"][16]
         assert metrics[f"hopper.{name}.train_seconds"] > 0 and metrics[f"hopper.{name}.updates"] == 2
-        assert any(line.startswith(f"hopper.{name}.open_loop: ") for line in lines)
+        assert any(line.startswith(f"hopper: {name}: nmse ") for line in lines)
     assert metrics["hopper.transformer.one_step_vs_ensemble"] == pytest.approx(
         metrics["hopper.transformer.one_step"] / metrics["hopper.ensemble.one_step"]
     )
@@ -50,8 +50,8 @@ def test_models_are_measured_on_draws_that_none_has_seen(tmp_path: Path, monkeyp
         starts = [np.asarray(file["observations"])[0] for file in (seen, new)]
     assert not np.array_equal(*starts)
     made = unseen.stat().st_mtime_ns
-    monkeypatch.setattr(hidden, "recognition", None)  # nothing is measured again
-    again = hidden.compare(tmp_path / "again.json", robots=["hopper"], report=lines.append, **facts)
+    monkeypatch.setattr(memory, "in_context_error", None)  # nothing is measured again
+    again = run_study(hidden, tmp_path / "again.json", robots=["hopper"], **facts)
     assert again == metrics and unseen.stat().st_mtime_ns == made
 
     def build(task: str, *arguments: Any, **options: Any) -> Suite:
@@ -59,15 +59,16 @@ def test_models_are_measured_on_draws_that_none_has_seen(tmp_path: Path, monkeyp
             raise KeyboardInterrupt
         return build_suite(task, *arguments, **options)
 
-    monkeypatch.setattr(hidden, "build_suite", build)
+    monkeypatch.setattr(study, "build_suite", build)
     with pytest.raises(KeyboardInterrupt):
-        hidden.compare(tmp_path / "part.json", robots=["hopper", "walker2d"], report=lines.append, **facts)
+        run_study(hidden, tmp_path / "part.json", robots=["hopper", "walker2d"], **facts)
     assert json.loads((tmp_path / "part.json").read_text()) == metrics and (tmp_path / "part.png").exists()
 
 
-def test_unknown_names_are_refused_before_any_work(tmp_path: Path) -> None:
+def test_what_cannot_be_measured_is_refused_before_any_work(tmp_path: Path) -> None:
+    facts: dict[str, Any] = dict(robots=["halfcheetah"], work=tmp_path, options=TINY)
     with pytest.raises(UserError, match="halfcheetah-meduim-hidden"):
-        hidden.compare(tmp_path / "hidden.json", tier="meduim", work=tmp_path, options=TINY)
+        run_study(MemoryStudy(), tmp_path / "hidden.json", tier="meduim", **facts)
     with pytest.raises(UserError, match="1 transitions are too few"):
-        hidden.compare(tmp_path / "hidden.json", work=tmp_path, options=TINY, measured=HiddenOptions(1))
+        run_study(MemoryStudy(HiddenOptions(1)), tmp_path / "hidden.json", tier="medium-replay", **facts)
     assert list(tmp_path.iterdir()) == []

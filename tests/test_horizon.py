@@ -18,15 +18,19 @@ from envtf_lit.figures import horizons
 from envtf_lit.figures.style import LABELS
 from envtf_lit.robots import tasks
 from envtf_lit.robots.tasks import ROBOTS, Task
-from envtf_lit.studies import horizon
-from envtf_lit.studies.horizon import ONLINE, SIZES, HorizonOptions, compare
-from envtf_lit.studies.suite import MODELS, Suite, SuiteOptions, build_suite
+from envtf_lit.studies import horizon, study
+from envtf_lit.studies.ablation import VARIANTS, run_ablation
+from envtf_lit.studies.horizon import ONLINE, SIZES, HorizonOptions, HorizonStudy
+from envtf_lit.studies.study import run_study
+from envtf_lit.studies.suite import MODELS, Suite, SuiteOptions, build_suite, model_params
 from envtf_lit.world_models.options import EnsembleOptions
+from envtf_lit.world_models.store import load_world_model
 
 ENSEMBLE = EnsembleOptions(
     members=2, elites=1, hidden=(8,), weight_decay=(0.0, 0.0), updates=2, updates_per_epoch=2, batch_size=8
 )
 TINY = SuiteOptions(transitions=1_000, updates=2, context=8, ensemble=ENSEMBLE, threads=1)
+FEW = HorizonOptions(6, 3)
 PROMISED = (
     "open_loop_0.01",
     "open_loop_0.1",
@@ -44,10 +48,9 @@ def short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tracking, "PROBE", 100)
 
 
-def run(folder: Path, lines: list[str], **options: Any) -> dict[str, Any]:
+def run(folder: Path, lines: list[str], measured: HorizonOptions = FEW, **options: Any) -> dict[str, Any]:
     facts: dict[str, Any] = dict(robots=["hopper"], tier="medium", work=folder / "work", options=TINY, progress=False)
-    facts |= dict(measured=HorizonOptions(6, 3), report=lines.append)
-    return compare(folder / "out/horizon.json", **facts | options)
+    return run_study(HorizonStudy(measured), folder / "out/horizon.json", report=lines.append, **facts | options)
 
 
 @pytest.mark.usefixtures("short_episodes")
@@ -65,7 +68,7 @@ def test_every_model_is_measured_once_and_all_of_it_is_written(tmp_path: Path) -
     ceilings = [numbers[f"hopper.physics.{size:g}.ceiling_0.01"] for size in SIZES]
     assert ceilings[-1] < min(ceilings[:-1])
     assert numbers["suite.updates"] == 2 and "versions.mujoco" in numbers
-    assert len(lines) == 3 + len(MODELS) and "min left" in lines[0]
+    assert len(lines) == 2 + len(MODELS) and "min left" in lines[0]
     table = (tmp_path / "out/horizon.md").read_text()
     assert table.count("| hopper | transformer |") == 1 + len(ONLINE)
     for name in ("open_loop", "teacher_forced", "online", "ceiling"):
@@ -107,7 +110,7 @@ def test_what_was_measured_is_written_before_the_next_robot(tmp_path: Path, monk
             raise KeyboardInterrupt
         return build_suite(task, *arguments, **options)
 
-    monkeypatch.setattr(horizon, "build_suite", build)
+    monkeypatch.setattr(study, "build_suite", build)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, [], robots=["hopper", "walker2d"], models=["context_1"])
     assert "hopper.context_1.open_loop_0.1" in json.loads((tmp_path / "out/horizon.json").read_text())
@@ -127,10 +130,31 @@ def test_what_was_measured_is_written_before_the_next_robot(tmp_path: Path, monk
 def test_what_cannot_be_measured_is_refused_before_any_work(
     tmp_path: Path, options: dict[str, Any], sentence: str
 ) -> None:
-    facts: dict[str, Any] = dict(robots=["hopper"], work=tmp_path / "work", options=TINY, measured=HorizonOptions())
     with pytest.raises(UserError, match=sentence):
-        compare(tmp_path / "horizon.json", **facts | options)
+        run(tmp_path, [], **options)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("short_episodes")
+def test_variants_are_trained_and_measured_beside_the_suite(tmp_path: Path) -> None:
+    out, names = tmp_path / "ablation.json", ["context_8", "updates_x2"]
+    options = replace(TINY, context=16)
+    numbers = run_ablation(
+        out, tier="medium", work=tmp_path, options=options, measured=FEW, names=names, progress=False
+    )
+    assert json.loads(out.read_text()) == numbers
+    assert all(f"hopper.{name}.open_loop_0.1" in numbers for name in (*MODELS, *names))
+    assert numbers["hopper.updates_x2.updates"] == 2 * numbers["hopper.context_8.updates"] == 4
+    model = load_world_model(tmp_path / "hopper-medium/models/context_8")
+    assert model.options == replace(load_world_model(tmp_path / "hopper-medium/models/transformer").options, context=8)
+    assert set(pd.read_csv(tmp_path / "ablation/ceiling.csv")["model"]) == {*MODELS, *names, "physics"}
+
+
+def test_variants_see_as_many_steps_per_update() -> None:
+    plain = model_params("transformer", "hopper-medium", SuiteOptions()).train_model
+    for change in VARIANTS.values():
+        train = change(plain)
+        assert train != plain and train.batch_size * train.model.context == plain.batch_size * plain.model.context
 
 
 @pytest.mark.parametrize("command", ["horizon", "calibrate"])

@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 from envtf_lit import load_world_model
 from envtf_lit.agents.cql import CQLOptions
 from envtf_lit.cli.arguments import given
-from envtf_lit.data.loaders import TransitionData, WindowData
+from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.options import DownloadOptions
 from envtf_lit.errors import UserError
 from envtf_lit.world_models.ensemble import EnsembleDynamics
@@ -138,7 +138,7 @@ def test_options_are_held_to_the_rules_of_params(
         ("model", "dropout", 1.0, "v<1"),
         ("model", "layers", 1.5, "invalid literal"),
         ("agent", "updates_per_epoch", 0, "v>0"),
-        ("agent", "warm_start", 1.0, "v<1"),
+        ("agent", "warm_start", -0.1, "v>=0"),
         ("agent", "hidden", [0], "v>0"),
     ],
 )

@@ -1,11 +1,15 @@
 """Windows, n-step transitions, and draws that a resumed run repeats."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
+from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import DrawSampler, Transitions, Windows, epoch_generator, return_weights
+from envtf_lit.data.sources.files import save_dataset
 
 
 def make_dataset(lengths=(3, 1, 5), terminated=(True, False, True)) -> OfflineDataset:
@@ -96,3 +100,21 @@ def test_processes_share_the_draws_of_one_with_their_batches_together():
     one = next(iter(DrawSampler(50, (4,), 1, seed=0, weights=weights)))
     second = next(iter(DrawSampler(50, (2,), 1, seed=0, weights=weights, process=(1, 2))))
     assert torch.equal(second, one[2:])
+
+
+def test_a_files_own_split_is_what_models_and_agents_are_given(tmp_path: Path):
+    dataset = make_dataset((3, 1, 5, 2, 2), (True, False, True, True, False))
+    save_dataset(dataset, path := tmp_path / "raw.h5")
+    windows = WindowData(str(path), held_out=0.4, seed=1)
+    windows.setup("fit")
+    assert windows.held_out.rewards.tolist() == dataset.split(0.4, seed=1)[1].rewards.tolist()
+    stored = dataset.with_split(0.4, seed=5)
+    training, held_out = stored.split()
+    assert held_out.rewards.tolist() != windows.held_out.rewards.tolist()
+    save_dataset(stored, path)
+    windows = WindowData(str(path), held_out=0.4, seed=1)
+    windows.setup("fit")
+    assert windows.held_out.rewards.tolist() == held_out.rewards.tolist()
+    assert windows.train.rewards.tolist() == training.rewards.tolist()
+    assert TransitionData(str(path), held_out=0.4, seed=1).dataset.rewards.tolist() == training.rewards.tolist()
+    assert len(TransitionData(str(path), seed=1).dataset) == len(dataset)

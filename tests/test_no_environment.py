@@ -157,7 +157,12 @@ def test_metrics_hold_no_score_and_only_finite_numbers(finished: tuple[Path, Par
     assert metrics["task"] is None
     assert "score" not in json.dumps(metrics)
     assert set(metrics["policies"]) == {"bc", "cql", "et_cql"}
-    names = {"label", "imagined_return_mean", "imagined_return_std", "action_error"}
+    assert {name: policy["world_model"] for name, policy in metrics["policies"].items()} == {
+        "bc": None,
+        "cql": None,
+        "et_cql": "transformer",
+    }
+    names = {"label", "algorithm", "world_model", "imagined_return_mean", "imagined_return_std", "action_error"}
     assert all(set(policy) == names for policy in metrics["policies"].values())
     assert metrics["held_out"]["episodes"] == 2  # of the three held out, one scales the predicted intervals
     assert metrics["policies"]["bc"]["action_error"] > 0
@@ -169,9 +174,10 @@ def test_metrics_hold_no_score_and_only_finite_numbers(finished: tuple[Path, Par
 def test_policies_never_saw_the_held_out_episodes_and_act_in_the_files_own_range(finished: tuple[Path, Params]):
     from envtf_lit.policy import load_policy
 
-    root, params = finished
+    root, _ = finished
     dataset = load_dataset(root / "data/dataset.h5")
-    training, _ = dataset.split(params.download.held_out, seed=params.seed)
+    training, held_out = dataset.split()
+    assert len(held_out.episode_starts) == 3
     for name in ("bc", "cql", "et_cql"):
         policy = load_policy(root / "models/policy" / name)
         mean, _ = training.observation_scale()
@@ -190,10 +196,11 @@ def test_there_are_plots_and_in_place_of_the_video_a_sentence(finished: tuple[Pa
 def test_the_report_says_that_nobody_measured_a_return(finished: tuple[Path, Params], repository: Path):
     root, params = finished
     (root / "notebooks").mkdir()
-    (root / "notebooks/report.ipynb").write_bytes((repository / "notebooks/report.ipynb").read_bytes())
+    name = "notebooks/report_offline.ipynb"
+    (root / name).write_bytes((repository / name).read_bytes())
     report(params, root, progress=False)
     text = said(root / "reports/report.ipynb")
-    assert "no simulator here, so nobody knows how any of them does" in text
+    assert "Only the robot can tell" in text
     assert "a classifier learned from the log says so" in text
     assert "No video" in text
     assert "D4RL" not in text and "hop" not in text.lower()

@@ -1,6 +1,5 @@
-"""The project around the package: pipeline, notebooks, README, and what a built wheel brings."""
+"""The project around the package: notebooks, README, what `envtf init` writes and what a built wheel brings."""
 
-import ast
 import json
 import os
 import re
@@ -8,151 +7,13 @@ import shlex
 import subprocess
 import sys
 import venv
-from functools import cache
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
-import grimp
 import pytest
-from ruamel.yaml import YAML
 
 from envtf_lit.cli.main import main
-from envtf_lit.cli.stages import STAGES, StageParser, split
 from envtf_lit.pipeline.yaml import load_params
-
-ROOT = Path(__file__).parent.parent
-# every stage reads its options through these, and DVC tracks the options' values themselves
-OPTIONS = {"envtf_lit.errors", "envtf_lit.pipeline.params"}
-
-
-def read_yaml(name: str) -> dict[str, Any]:
-    return YAML(typ="safe", pure=True).load(ROOT / name)
-
-
-def stages() -> dict[str, dict[str, Any]]:
-    """dvc.yaml's stages by their full names, each foreach over a section of params.yaml written out."""
-    written, params = {}, read_yaml("params.yaml")
-    for name, stage in read_yaml("dvc.yaml")["stages"].items():
-        if "foreach" not in stage:
-            written[name] = filled(stage, params)
-            continue
-        for key, item in params[stage["foreach"][2:-1]].items():
-            written[f"{name}@{key}"] = filled(stage["do"], params | {"key": key, "item": item})
-    return written
-
-
-def filled(stage: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """A stage with the values of its `${a.b}`."""
-
-    def value(match: re.Match[str]) -> str:
-        found: Any = values
-        for name in match[1].split("."):
-            found = found[name]
-        return str(found)
-
-    return json.loads(re.sub(r"\$\{([\w.]+)\}", value, json.dumps(stage)))
-
-
-# the pipeline's own file
-
-
-def test_every_stage_is_a_command_and_a_function() -> None:
-    names = [name.partition("@")[0] for name in stages()]
-    assert list(dict.fromkeys(names)) == list(STAGES)
-    for name, stage in stages().items():
-        program, command, *words = shlex.split(stage["cmd"])
-        own, overrides = split(words)
-        assert (program, command, overrides) == ("envtf", name.partition("@")[0], [])
-        assert StageParser(command).parse_args(own).params == "params.yaml"
-        assert callable(getattr(import_module(f"envtf_lit.pipeline.{command}"), command))
-
-
-def test_every_tracked_option_is_in_params_yaml() -> None:
-    for stage in stages().values():
-        for key in stage.get("params", []):
-            tree = read_yaml("params.yaml")
-            for name in key.split("."):
-                assert name in tree, key
-                tree = tree[name]
-
-
-def test_every_option_is_tracked_by_some_stage() -> None:
-    tracked = {key for stage in stages().values() for key in stage.get("params", [])}
-    top = {key.partition(".")[0] for key in tracked}
-    assert top == read_yaml("params.yaml").keys()
-    assert {f"train_policy.{name}" for name in read_yaml("params.yaml")["train_policy"]} <= tracked
-
-
-def test_the_policy_from_data_alone_is_not_trained_anew_for_imagination() -> None:
-    cql, et_cql = stages()["train_policy@cql"], stages()["train_policy@et_cql"]
-    assert "train_policy.et_cql" not in cql["params"]
-    assert not {"data/rollouts.h5", "models/world_model"} & set(cql["deps"])
-    assert {"data/rollouts.h5", "models/world_model"} <= set(et_cql["deps"])
-
-
-def test_what_a_stage_reads_another_writes() -> None:
-    outputs = {path for stage in stages().values() for path in stage["outs"]}
-    for stage in stages().values():
-        made = {path for path in stage.get("deps", []) if path.split("/")[0] in ("data", "models", "reports")}
-        assert made <= outputs
-
-
-def test_code_that_stages_name_exists() -> None:
-    for stage in stages().values():
-        assert [
-            path for path in stage["deps"] if path.startswith(("envtf_lit", "notebooks")) and not (ROOT / path).exists()
-        ] == []
-
-
-# each stage's dependencies against its imports
-
-
-@cache
-def imports() -> grimp.ImportGraph:
-    return grimp.build_graph("envtf_lit")
-
-
-def imported_names(node: ast.AST) -> set[str]:
-    """The package's modules that the import statements below a syntax node name."""
-    names = set()
-    for statement in ast.walk(node):
-        if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith("envtf_lit"):
-            inner = {f"{statement.module}.{alias.name}" for alias in statement.names}
-            names |= inner & imports().modules or {str(statement.module)}
-    return names
-
-
-def is_options(module: str) -> bool:
-    return module in OPTIONS or module.endswith(".options") or module.startswith("envtf_lit.options.")
-
-
-def modules_of(stage: str) -> set[str]:
-    """All modules of the package that a stage's file imports, directly or through others, but for the options."""
-    direct = {f"envtf_lit.pipeline.{stage.partition('@')[0]}"}
-    for path in stages()[stage]["deps"]:
-        if path.endswith(".ipynb"):
-            cells = json.loads((ROOT / path).read_text())["cells"]
-            code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
-            direct |= imported_names(ast.parse("\n".join(code)))
-    reached, waiting = set(), list(direct)
-    while waiting:
-        module = waiting.pop()
-        reached.add(module)
-        following = {name for name in imports().find_modules_directly_imported_by(module) if not is_options(name)}
-        waiting += following - reached
-    packages = {module for module in reached if imports().find_children(module)}
-    return reached - packages
-
-
-@pytest.mark.parametrize("stage", stages())
-def test_a_stage_depends_on_the_code_it_imports_and_no_other(stage: str) -> None:
-    declared = {path for path in stages()[stage]["deps"] if path.startswith("envtf_lit/")} - {"envtf_lit/assets/zoo"}
-    needed = {f"{module.replace('.', '/')}.py" for module in modules_of(stage)}
-    missing = {path for path in needed if not declared & {path, *map(str, Path(path).parents)}}
-    idle = {path for path in declared if path not in needed and not any(p.startswith(f"{path}/") for p in needed)}
-    assert (missing, idle) == (set(), set())
-
+from tests.test_dvc import ROOT, SEVEN, STRONG, all_params, stages
 
 # notebooks
 
@@ -216,11 +77,11 @@ def test_readmes_make_commands_exist(command: str) -> None:
 @pytest.mark.parametrize("command", [line for line in commands_in_readme() if "-S " in line])
 def test_readmes_experiments_change_real_options(command: str) -> None:
     overrides = re.findall(r"-S (\S+)", command)
-    assert load_params(ROOT / "params.yaml", overrides) != load_params(ROOT / "params.yaml")
+    assert load_params(ROOT / "params.yaml", overrides) != all_params()
 
 
 def test_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text().split()) <= 600
+    assert len((ROOT / "README.md").read_text().split()) <= 700
 
 
 # the whole of it
@@ -246,16 +107,40 @@ def test_tiny_pipeline_runs_once_and_an_experiment_reruns_only_its_part(tmp_path
     pipeline_before = (tmp_path / "dvc.yaml").read_text()
     call("dvc", "repro")
     metrics = json.loads((tmp_path / "reports/metrics.json").read_text())
-    assert metrics["policy"]["episodes"] == 2
-    assert call("dvc", "repro").count("didn't change, skipping") == len(stages())
+    assert {name: found["episodes"] for name, found in metrics["policies"].items()} == {"bc": 2, "cql": 2, "et_cql": 2}
+    again = call("dvc", "repro")
+    assert re.findall(r"Running stage '(.*)'", again) == ["source"]  # which looks whether a file of one's own changed
+    assert again.count("didn't change, skipping") == len(stages()) - 1
     assert (tmp_path / "dvc.yaml").read_text() == pipeline_before
     call("git", "add", ".")
     call("git", "-c", "user.name=a", "-c", "user.email=a@b.c", "commit", "-qm", "run")
     again = call("dvc", "exp", "run", "-S", "train_policy.et_cql.cql_weight=1")
-    assert re.findall(r"Running stage '(.*)'", again) == ["train_policy@et_cql", "evaluate", "report"]
+    ran = [stage for stage in re.findall(r"Running stage '(.*)'", again) if stage != "source"]
+    assert ran == ["train_policy@et_cql", "evaluate", "report"]
     call("git", "checkout", "params.yaml", "dvc.lock")
     call("dvc", "checkout")
     assert json.loads((tmp_path / "reports/metrics.json").read_text()) == metrics
+
+
+@pytest.mark.slow
+def test_dvc_sees_a_section_that_was_added(tmp_path: Path) -> None:
+    main(["init", str(tmp_path), "--preset", "tiny"])
+    text = (tmp_path / "params.yaml").read_text()
+    for stage, section in (("train_policy", STRONG), ("train_model", SEVEN)):
+        text = re.sub(rf"^{stage}:.*$", rf"\g<0>\n  {section}", text, flags=re.MULTILINE)
+    (tmp_path / "params.yaml").write_text(text)
+
+    def dvc(*words: str) -> list[str]:
+        command, env = [sys.executable, "-m", "dvc", *words], environment(Path(sys.prefix))
+        return subprocess.run(
+            command, cwd=tmp_path, env=env, capture_output=True, text=True, check=True
+        ).stdout.splitlines()
+
+    added = {"train_policy@cql_strong", "train_model@seven", "generate_rollouts@seven"}
+    assert {*dvc("stage", "list", "--all", "--name-only")} == stages().keys() | added
+    edges = {line for line in dvc("dag", "--dot", "train_policy@cql_strong") if "->" in line}
+    # from no model, nor from its rollouts
+    assert edges == {'"source" -> "download";', '"download" -> "train_policy@cql_strong";'}
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The gradient of imagined returns: paths, their value by hand, and an actor that climbs a world it can work out."""
+"""The gradient of imagined returns: paths, their value by hand, and an actor that improves in a world known exactly."""
 
 import copy
 from dataclasses import replace
@@ -6,18 +6,19 @@ from typing import Any
 
 import pytest
 import torch
-from analytic import linear_data, linear_world
 from torch import Tensor, nn
 
-from envtf_lit.agents.cql import CQL
-from envtf_lit.agents.options import PolicyOptions
-from envtf_lit.agents.value_gradient import Paths, ValueGradient
+from envtf_lit.agents import value_gradient
+from envtf_lit.agents.et_cql import ETCQL
+from envtf_lit.agents.value_gradient import BETAS, ImaginedPaths, StateValues, ValueGradient, ValueGradientOptions
 from envtf_lit.errors import UserError
-from envtf_lit.imagination.options import ImaginationOptions, ValueGradientOptions
-from envtf_lit.imagination.rollouts import Imagination
+from envtf_lit.imagination.options import RolloutOptions
+from envtf_lit.imagination.rollouts import Rollouts
 from envtf_lit.pipeline.params import build_params
+from tests.analytic import linear_data
+from tests.hand_driven import EPISODES, flat, hand_driven, imagination, imagined_batches, made_rollouts
 
-OPTIONS = ValueGradientOptions(updates=4, rollouts=6, horizon=3, max_steps=9, trace=0.5, value_passes=2)
+OPTIONS = ValueGradientOptions(updates=4, rollouts=6, horizon=3)
 ONE = torch.ones(())
 
 
@@ -35,33 +36,28 @@ class Constant(nn.Module):
         return self.level.expand(observation.shape[:-1])
 
 
-def make_gradient(value: float = 0.0, **options) -> ValueGradient:
-    gradient = ValueGradient(3, replace(OPTIONS, **options))
-    gradient.value = gradient.target_value = Constant(value)  # pyright: ignore[reportAttributeAccessIssue]
-    return gradient
+def make_values(value: float) -> StateValues:
+    values = StateValues(3)
+    values.value = values.target_value = Constant(value)  # pyright: ignore[reportAttributeAccessIssue]
+    return values
 
 
-def make_imagination(fall_beyond: float = float("inf"), history: int = 2) -> Imagination:
-    options = ImaginationOptions(history=history, mode="mean", posterior=0.0, novelty_limit=None)
-    return Imagination(linear_world(), linear_data((30, 40)), lambda s: s[:, 0] > fall_beyond, options)
-
-
-def hand_made() -> Paths:
-    """Two rollouts of three steps; the second falls at its second step."""
-    fell = torch.tensor([[False, False], [False, True], [False, False]])
-    rewards = torch.tensor([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
-    states = torch.zeros(3, 2, 3)
-    return Paths(states, torch.zeros(3, 2, 1), rewards, states, fell)
+def hand_made(last_reward: float = 3.0) -> Rollouts:
+    """Two rollouts of three steps, neither of which leaves; the second falls at its second step."""
+    paths = made_rollouts([[1.0, 1.0], [2.0, 2.0], [3.0, last_reward]])
+    paths.terminated[1, 1] = True
+    return paths
 
 
 def test_a_paths_return_ends_with_the_fall_and_else_with_the_states_value():
-    returns = make_gradient(value=10.0).imagined_return(hand_made(), discount=0.5)
+    returns = make_values(10.0).imagined_return(hand_made(), discount=0.5)
     torch.testing.assert_close(returns, torch.tensor([1.0 + 1.0 + 0.75 + 0.125 * 10.0, 1.0 + 1.0]))
 
 
 @pytest.mark.parametrize("trace", [0.0, 0.5, 1.0])
-def test_value_targets_are_td_lambda(trace):
-    targets = make_gradient(value=10.0, trace=trace).value_targets(hand_made(), discount=0.5)
+def test_value_targets_are_td_lambda(trace, monkeypatch):
+    monkeypatch.setattr(value_gradient, "TRACE", trace)
+    targets = make_values(10.0).value_targets(hand_made(), discount=0.5)
     last = 3.0 + 0.5 * 10.0
     middle = 2.0 + 0.5 * ((1 - trace) * 10.0 + trace * last)
     first = 1.0 + 0.5 * ((1 - trace) * 10.0 + trace * middle)
@@ -69,24 +65,30 @@ def test_value_targets_are_td_lambda(trace):
     torch.testing.assert_close(targets[:2, 1], torch.tensor([1.0 + 0.5 * ((1 - trace) * 10.0 + trace * 2.0), 2.0]))
 
 
-def test_steps_after_a_fall_teach_nothing():
-    paths = replace(hand_made(), rewards=torch.tensor([[1.0, 1.0], [2.0, 2.0], [3.0, 1e6]]))
-    gradient, generator = make_gradient(value=10.0, value_passes=3), torch.Generator().manual_seed(0)
-    lessons = list(gradient.lessons(paths, 0.5, generator))
-    assert sum(len(states) for states, _ in lessons) == 3 * 5
-    assert max(float(targets.max()) for _, targets in lessons) < 100.0
+def test_the_value_learns_nothing_from_steps_after_a_fall(monkeypatch):
+    monkeypatch.setattr(value_gradient, "PASSES", 3)
+    batches = list(make_values(10.0).value_batches(hand_made(1e6), 0.5, torch.Generator().manual_seed(0)))
+    assert sum(len(states) for states, _ in batches) == 3 * 5
+    assert max(float(targets.max()) for _, targets in batches) < 100.0
+
+
+def test_every_pass_pairs_each_state_with_its_target(monkeypatch):
+    monkeypatch.setattr(value_gradient, "BATCH", 2)
+    values, paths = make_values(10.0), hand_made()
+    targets = values.value_targets(paths, 0.5)
+    expected = {(float(paths.observations[t, b, 0]), float(targets[t, b])) for t in range(3) for b in range(2)}
+    expected.discard((12.0, float(targets[2, 1])))  # after the fall
+    batches = list(values.value_batches(paths, 0.5, torch.Generator().manual_seed(0)))
+    assert {len(states) for states, _ in batches} == {1, 2}
+    pairs = [(float(s[0]), float(g)) for states, goals in batches for s, g in zip(states, goals, strict=True)]
+    assert set(pairs) == expected and len(pairs) == value_gradient.PASSES * 5
 
 
 def test_the_gradient_through_the_world_equals_finite_differences():
     def value(level: float) -> tuple[Tensor, Constant]:
-        actor = Constant(level)
-        paths = make_gradient(value=2.0).paths(
-            actor,  # pyright: ignore[reportArgumentType]
-            make_imagination(),
-            ONE,
-            torch.Generator().manual_seed(0),
-        )
-        return make_gradient(value=2.0).imagined_return(paths, 0.9).mean(), actor
+        actor: Any = Constant(level)
+        paths = ImaginedPaths(imagination(), OPTIONS).next(actor, ONE, torch.Generator().manual_seed(0))
+        return make_values(2.0).imagined_return(paths, 0.9).mean(), actor
 
     middle, actor = value(0.3)
     middle.backward()
@@ -95,49 +97,74 @@ def test_the_gradient_through_the_world_equals_finite_differences():
     torch.testing.assert_close(actor.level.grad, slope, rtol=1e-3, atol=1e-5)
 
 
-def test_rollouts_go_on_where_they_stood_until_they_are_old():
-    gradient, imagination, generator = make_gradient(max_steps=6), make_imagination(), torch.Generator().manual_seed(0)
+def test_rewards_of_paths_are_divided_by_the_scale():
+    def rewards(scale: float) -> Tensor:
+        actor: Any = Constant(0.1)
+        paths = ImaginedPaths(imagination(), OPTIONS).next(actor, torch.tensor(scale), torch.Generator().manual_seed(0))
+        return paths.rewards
+
+    torch.testing.assert_close(rewards(4.0), rewards(1.0) / 4.0)
+
+
+def test_rollouts_go_on_where_they_stood_until_they_are_old(monkeypatch):
+    monkeypatch.setattr(value_gradient, "OLDEST", 6)
+    paths, generator = ImaginedPaths(imagination(), OPTIONS), torch.Generator().manual_seed(0)
     actor: Any = Constant(0.1)
-    first, second, third = (gradient.paths(actor, imagination, ONE, generator) for _ in range(3))
+    first, second, third = (paths.next(actor, ONE, generator) for _ in range(3))
     torch.testing.assert_close(second.observations[0], first.next_observations[-1])
     assert not torch.isclose(third.observations[0], second.next_observations[-1]).all(-1).any()
 
 
+def begins_at_real_states(paths: Rollouts) -> bool:
+    real = torch.as_tensor(linear_data(EPISODES).observations)
+    return bool((torch.cdist(paths.observations[0].detach(), real).min(1).values < 1e-3).all())
+
+
 def test_the_fallen_begin_anew_at_real_states():
-    imagination = make_imagination(fall_beyond=-1e9)  # every robot falls at once
-    gradient, generator, actor = make_gradient(), torch.Generator().manual_seed(0), Constant(0.1)
-    real = torch.as_tensor(linear_data((30, 40)).observations)
+    paths, generator = ImaginedPaths(imagination(-1e9), OPTIONS), torch.Generator().manual_seed(0)  # all fall at once
+    actor: Any = Constant(0.1)
     for _ in range(2):
-        paths = gradient.paths(actor, imagination, ONE, generator)  # pyright: ignore[reportArgumentType]
-        assert paths.alive[1:].sum() == 0
-        starts = paths.observations[0].detach()
-        assert (torch.cdist(starts, real).min(1).values < 1e-3).all()
+        found = paths.next(actor, ONE, generator)
+        assert found.terminated.all() and found.valid.all()  # no rollout leaves
+        assert value_gradient.standing(found)[1:].sum() == 0
+        assert begins_at_real_states(found)
 
 
-def make_agent() -> CQL:
-    torch.manual_seed(0)
-    options = replace(make_imagination().options, value_gradient=replace(OPTIONS, updates=60, learning_rate=0.01))
-    agent = CQL(3, 1, PolicyOptions(hidden=(16, 16), updates=60, warm_start=0, discount=0.9, imagination=options))
-    agent.generator, agent.update_index = torch.Generator().manual_seed(0), 0
-    agent.imagination = make_imagination()
-    optimizers = agent.configure_optimizers()
-    agent.optimizers = lambda *_: optimizers  # pyright: ignore[reportAttributeAccessIssue]
-    agent.manual_backward = lambda loss: loss.backward()  # pyright: ignore[reportAttributeAccessIssue]
-    return agent
+def test_rollouts_under_way_do_not_outlive_an_epoch():
+    phase, generator = ValueGradient(imagination(), make_values(0.0), OPTIONS), torch.Generator().manual_seed(0)
+    actor: Any = Constant(1.0)
+    for begun, real in ((False, True), (False, False), (True, True)):
+        if begun:
+            phase.begin_epoch(None)  # pyright: ignore[reportArgumentType]
+        assert begins_at_real_states(phase.paths.next(actor, ONE, generator)) is real
 
 
-def test_the_actor_climbs_and_leaves_the_critics_alone(monkeypatch):
-    """More action is more reward in this world, so the mean action rises towards its limit."""
-    agent = make_agent()
-    monkeypatch.setattr(agent, "clip_gradients", lambda *_, **__: None)
-    critics = copy.deepcopy(agent.critics.state_dict())
-    data = linear_data((30, 40))
-    batch = dict(
+def test_the_learning_rate_rises_over_a_tenth_and_falls_to_zero():
+    phase = ValueGradient(imagination(), make_values(0.0), replace(OPTIONS, learning_rate=0.9))
+    progress = [0.0, 0.05, 0.1, 0.55, 1.0]
+    assert [phase.rate(x) for x in progress] == pytest.approx([0.0, 0.45, 0.9, 0.45, 0.0])
+
+
+def make_agent() -> Any:
+    options = replace(OPTIONS, updates=60, learning_rate=0.01)
+    plain = RolloutOptions(history=2, mode="mean", posterior=0.0, novelty_limit=None)
+    return hand_driven(ETCQL, source=imagined_batches(), discount=0.9, rollouts=plain, value_gradient=options)
+
+
+def log_batch() -> dict[str, Tensor]:
+    data = linear_data(EPISODES)
+    return dict(
         observations=torch.as_tensor(data.observations),
         actions=torch.zeros(len(data), 1),
         rewards=torch.as_tensor(data.rewards),
         returns=torch.as_tensor(data.rewards),
     )
+
+
+def test_the_actor_improves_and_leaves_the_critics_alone():
+    """More action is more reward in this world, so the mean action rises towards its limit."""
+    agent, batch = make_agent(), log_batch()
+    critics = copy.deepcopy(agent.critics.state_dict())
     before = float(agent.actor.act(batch["observations"], deterministic=True).mean())
     for _ in range(60):
         agent.update(batch)
@@ -147,11 +174,47 @@ def test_the_actor_climbs_and_leaves_the_critics_alone(monkeypatch):
     assert all(torch.equal(value, critics[name]) for name, value in agent.critics.state_dict().items())
 
 
+def test_the_value_gradient_begins_at_the_averaged_actor_with_an_adam_of_its_own():
+    agent = make_agent()
+    average = flat(copy.deepcopy(agent.average_actor.state_dict()))
+    nn.init.ones_(agent.actor.net[0].weight)
+    agent.update(log_batch())  # at a rate of zero
+    assert torch.equal(flat(agent.actor.state_dict()), average)
+    assert agent.optimizer("actor_by_gradient").param_groups[0]["betas"] == BETAS
+    assert agent.optimizer("actor").param_groups[0]["betas"] == (0.9, 0.999)
+
+
+def test_the_warm_start_fits_the_state_value_to_the_logs_returns():
+    options = RolloutOptions(history=2)
+    agent = hand_driven(
+        ETCQL, source=imagined_batches(), warm_start=0.5, rollouts=options, value_gradient=replace(OPTIONS, updates=30)
+    )
+    batch = log_batch()
+
+    def error() -> float:
+        return agent.values.value_loss(batch["observations"], batch["returns"]).item()
+
+    before = error()
+    for _ in range(30):
+        agent.update(batch)
+        agent.update_index += 1
+    assert error() < 0.2 * before
+    assert torch.equal(flat(agent.values.target_value.state_dict()), flat(agent.values.value.state_dict()))
+
+
+def test_without_a_value_gradient_there_is_no_state_value():
+    agent = hand_driven(ETCQL, source=imagined_batches(), value_gradient=None)
+    assert [*agent.parts()] == ["actor", "critics", "temperature"] and not hasattr(agent, "values")
+    assert len(agent.phases) == 2
+
+
 @pytest.mark.parametrize(
-    ("value_gradient", "words"),
+    ("changed", "words"),
     [({"horizon": 2}, ["horizon is 2", "history is 4"]), ({"updates": 4_000}, ["updates is 4000", "3000 updates"])],
 )
-def test_contradicting_options_are_named(value_gradient, words):
-    with pytest.raises(UserError) as error:
-        build_params({"train_policy": {"et_cql": {"imagination": {"value_gradient": value_gradient}}}})
+def test_contradicting_options_are_named(changed, words):
+    section = {"algorithm": "et_cql", "value_gradient": changed}
+    bc = {"algorithm": "bc"}
+    with pytest.raises(UserError, match=r"^train_policy\.mine\.") as error:
+        build_params({"train_policy": {"bc": bc, "mine": section}})
     assert all(word in str(error.value) for word in words)

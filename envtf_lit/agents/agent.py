@@ -2,7 +2,7 @@
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -11,11 +11,12 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit import training
-from envtf_lit.agents.options import NO_WORLD_MODEL, PolicyOptions
-from envtf_lit.data.loaders import TransitionData, epoch_generator
+from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.data.datamodules import TransitionData
+from envtf_lit.data.loaders import epoch_generator
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.buffer import ImaginedBatches
-from envtf_lit.options.schema import build, rebuild
+from envtf_lit.options.schema import build
 from envtf_lit.policy import TanhGaussianActor, load_policy
 
 Batch = dict[str, Tensor]
@@ -122,11 +123,17 @@ class Agent(L.LightningModule, ABC):
         freeze: Sequence[str] = (),
     ) -> None:
         super().__init__()
-        if self.imagines is not (source is not None):
-            needs = "learns in a world model: give it one" if self.imagines else "learns from data alone"
-            raise UserError(f"{self.label} {needs} (world_model is {(options and _world_model(options))!r}).")
-        plain = options if isinstance(options, Mapping) else None
-        self.options = build(self.Options, plain, "") if plain is not None else rebuild(options or self.Options())
+        if self.imagines and source is None:
+            raise UserError(
+                f"{self.label} imagines and has no source of imagined rows: give it one, source=ImaginedBatches(…)."
+            )
+        if source is not None and not self.imagines:
+            raise UserError(
+                f"{self.label} learns from data alone and is given a source of imagined rows: leave it out."
+            )
+        if not isinstance(options, dict):
+            options = asdict(options or self.Options())
+        self.options = build(self.Options, options, "")
         self.save_hyperparameters(
             dict(
                 observation_dim=observation_dim,
@@ -214,7 +221,8 @@ class Agent(L.LightningModule, ABC):
             if done < phase.updates:
                 return phase.update(self, batch, done)
             done -= phase.updates
-        return self.phases[-1].update(self, batch, self.phases[-1].updates - 1)  # asked for more than planned
+        last = next(phase for phase in reversed(self.phases) if phase.updates > 0)
+        return last.update(self, batch, last.updates - 1)  # asked for more than planned
 
     def clone_loss(self, batch: Batch) -> Tensor:
         """`-log pi(a|s)`, mean over the real rows."""
@@ -286,10 +294,6 @@ class Agent(L.LightningModule, ABC):
     def validation_logs(self, batch: Batch) -> Logs:
         """Further scalars to log of held-out rows."""
         return {}
-
-
-def _world_model(options: PolicyOptions | dict[str, Any]) -> str:
-    return options.get("world_model", NO_WORLD_MODEL) if isinstance(options, dict) else options.world_model
 
 
 @torch.no_grad()

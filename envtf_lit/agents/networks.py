@@ -23,8 +23,7 @@ class StackedLinear(nn.Module):
 
 
 class StackedCritics(nn.Module):
-    """n independent Q-functions `Q_i(s, a)`, each an MLP with ReLU and, if wanted, LayerNorm
-    (without gain and shift).
+    """n independent Q-functions `Q_i(s, a)`, each an MLP with ReLU and, if wanted, LayerNorm.
 
     The first layer's state part is computed once per state, however many actions are asked about.
     """

@@ -5,7 +5,7 @@ from typing import Literal
 
 from envtf_lit.data.loaders import UPDATES_PER_STEP
 from envtf_lit.errors import UserError
-from envtf_lit.options.numbers import Count, NonzeroShare, Positive, Share
+from envtf_lit.options.numbers import Count, NonNegative, NonzeroShare, Positive, Share
 from envtf_lit.options.schema import check_epochs, rare
 
 NO_WORLD_MODEL = "none"
@@ -32,7 +32,7 @@ class CommonOptions:
         actor_schedule: of the actor's learning rate after the warm start: `constant`, or half a cosine to zero.
         critic_learning_rate: Adam's.
         warm_start: share of the updates, the first ones, in which critics fit Monte-Carlo returns and the actor clones
-            the data, for algorithms that have both.
+            the data, for algorithms that have both; from 1 on their number, at most all.
         actor_average: share of the actor that enters the averaged actor at each update; the average is what is saved.
     """
 
@@ -49,7 +49,7 @@ class CommonOptions:
     actor_learning_rate: Positive = 0.0003
     actor_schedule: Literal["constant", "cosine"] = rare("cosine")
     critic_learning_rate: Positive = 0.0003
-    warm_start: Share = 0.3333
+    warm_start: NonNegative = 0.3333
     actor_average: NonzeroShare = 0.002
 
     def __post_init__(self) -> None:
@@ -60,7 +60,7 @@ class CommonOptions:
     @property
     def warm_updates(self) -> int:
         """Updates of the warm start."""
-        return round(self.warm_start * self.updates)
+        return min(self.updates, round(self.warm_start * (self.updates if self.warm_start < 1 else 1)))
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,9 @@
 
 Positional-only parameters, and `*parameter`, are words in their order; all others are flags. jsonargparse parses and
 checks; its `add_function_arguments` would want `--quiet true` and `--robots [hopper,ant]`, so the arguments are added
-one by one: `--quiet` alone sets what is false by default, a list of choices takes several words, a list of text is a
-flag that may be repeated. Neither files nor the environment set anything, and no type here names a class to make.
+one by one: `--quiet` alone sets what is false by default, a list of choices or numbers takes several words, a list of
+text is a flag that may be repeated. Neither files nor the environment set anything, and no type here names a class to
+make.
 """
 
 import argparse
@@ -163,8 +164,8 @@ class _Parser(ArgumentParser):
             options["help"] = f"{meaning}{'; required' if required else _shown(argument.default)}"
             if argument.type is bool:
                 options = {name: options[name] for name in ("dest", "default", "help")} | {"action": "store_true"}
-            elif argument.choices and argument.many:
-                options |= {"nargs": "+", "default": list(argument.default)}
+            elif argument.many and argument.type is not str:
+                options |= {"nargs": "+", "default": argument.default and list(argument.default)}
             elif argument.many:
                 del options["type"]  # text as it is
                 options |= {"action": "append", "default": []}

@@ -24,6 +24,7 @@ _CHECKPOINT = "To go on from the last finished epoch, add --ckpt_path and the ne
 _KEPT = "The same command keeps the models that are trained and measured, and goes on with the others."
 
 COMMANDS = {
+    "source": Command("stages", "Note the checksum of a file of yours, so that a changed one is noticed"),
     "download": Command("stages", "Make or read the dataset: data/dataset.h5"),
     "train_model": Command("stages", "Train a world model: models/world_model/NAME/", _EPOCH),
     "generate_rollouts": Command(

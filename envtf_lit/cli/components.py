@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.registry import ALGORITHMS
+from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import TransitionData, WindowData
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.data.sources.minari import read_minari
 from envtf_lit.world_models.lit import LitWorldModel, lit_world_model

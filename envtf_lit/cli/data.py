@@ -25,17 +25,28 @@ def check(source: Source, /, *, task: str | None = None) -> None:
         raise SystemExit(2)
 
 
-def convert(source: Source, target: Target, /, *, task: str | None = None) -> None:
+def convert(
+    source: Source,
+    target: Target,
+    /,
+    *,
+    task: str | None = None,
+    action_low: tuple[float, ...] | None = None,
+    action_high: tuple[float, ...] | None = None,
+) -> None:
     """Writes a dataset in another format.
 
     Args:
         source: HDF5 or NPZ file, minari:ID, or a Minari dataset's folder.
         target: a new file ending in .h5, .hdf5 or .npz, or minari:ID.
         task: robot and tier that the data came from, such as hopper-medium.
+        action_low: low limits of the actions, one number or one for each dimension, where the file states none.
+        action_high: high limits, likewise.
     """
     from envtf_lit.data import conversion
 
-    dataset, findings = conversion.convert(source, target, task=task)
+    limits = dict(action_low=action_low, action_high=action_high)
+    dataset, findings = conversion.convert(source, target, task=task, **limits)
     out = console()
     out.print(f"Wrote {len(dataset):,} transitions to {target}")
     for finding in findings:

@@ -12,7 +12,7 @@ from lightning.pytorch.cli import SaveConfigCallback
 from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.store import publish_policy
 from envtf_lit.cli.output import console
-from envtf_lit.data.loaders import WindowData
+from envtf_lit.data.datamodules import WindowData
 from envtf_lit.files import replacing
 from envtf_lit.training import Curves
 from envtf_lit.world_models.fit import publish_world_model

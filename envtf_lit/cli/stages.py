@@ -4,6 +4,7 @@ import argparse
 import os
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from textwrap import fill
 from typing import NamedTuple, NoReturn
 
@@ -25,6 +26,7 @@ class Stage(NamedTuple):
 
 
 STAGES = {
+    "source": Stage(("download",)),
     "download": Stage(("download",)),
     "train_model": Stage(("train_model",), named=True),
     "generate_rollouts": Stage(("generate_rollouts",), named=True),
@@ -53,6 +55,11 @@ def run(name: str, words: Sequence[str]) -> None:
     section = {"name": options.name} if STAGES[name].named else {}
     metrics = stage(params, **section, progress=not options.quiet)
     console().print_json(data=metrics)
+    if overrides and Path("dvc.yaml").exists():
+        console(stderr=True).print(
+            f"params.yaml does not say {' '.join(overrides)}: the next `dvc repro` puts back what it does say. Write "
+            "it there, or use `dvc exp run -S`."
+        )
 
 
 class StageParser(argparse.ArgumentParser):
@@ -71,7 +78,7 @@ class StageParser(argparse.ArgumentParser):
         """With all options of params.yaml, which take too long to read for another command."""
         from envtf_lit.pipeline.yaml import describe
 
-        lines = ["", "options of params.yaml, each also a flag, such as --seed 1 or --policy.updates=500:"]
+        lines = ["", "options of params.yaml, each also a flag, such as --seed 1 or --policy.updates=9000:"]
         for option in (option for part in (*GLOBAL_OPTIONS, *self.stage.sections) for option in describe(part)):
             default = "null" if option.default is None else option.default
             lines.append(f"  --{option.key}  ({option.kind}, default {default})")
@@ -87,7 +94,7 @@ class StageParser(argparse.ArgumentParser):
         what, _, words = message.partition(": ")
         if what == "unrecognized arguments":
             raise UserError(
-                f"{words.split()[0]!r} is not an option: write --section.key value, such as --policy.updates 500."
+                f"{words.split()[0]!r} is not an option: write --section.key value, such as --policy.updates 9000."
             )
         raise UserError(f"{message[0].upper()}{message[1:]} (see `{self.prog} --help`).")
 

@@ -57,7 +57,7 @@ class Training:
         return SuiteOptions(ensemble=ensemble, **{name: getattr(self, name) for name in names})
 
     def comparison(self) -> dict[str, Any]:
-        """Arguments of every `compare`."""
+        """Arguments of every `run_study`."""
         return dict(work=self.work, options=self.options(), progress=not self.quiet, report=console().print)
 
 
@@ -82,9 +82,10 @@ def hidden(
         unseen: rows to measure on.
         training: of the suite.
     """
-    from envtf_lit.studies.memory import HiddenOptions, compare
+    from envtf_lit.studies.memory import HiddenOptions, MemoryStudy
+    from envtf_lit.studies.study import run_study
 
-    compare(out, robots=robots, tier=tier, measured=HiddenOptions(unseen), **training.comparison())
+    run_study(MemoryStudy(HiddenOptions(unseen)), out, robots=robots, tier=tier, **training.comparison())
 
 
 def horizon(
@@ -111,10 +112,11 @@ def horizon(
         training: of the suite.
     """
     others = _named_folders(model)
-    from envtf_lit.studies.horizon import HorizonOptions, compare
+    from envtf_lit.studies.horizon import HorizonOptions, HorizonStudy
+    from envtf_lit.studies.study import run_study
 
-    measured = HorizonOptions(trajectories, online, start)
-    compare(out, robots=robots, tier=tier, measured=measured, others=others, **training.comparison())
+    study = HorizonStudy(HorizonOptions(trajectories, online, start))
+    run_study(study, out, robots=robots, tier=tier, others=others, **training.comparison())
 
 
 def calibrate(
@@ -135,9 +137,10 @@ def calibrate(
         training: of the suite.
     """
     others = _named_folders(model)
-    from envtf_lit.studies.calibration import compare
+    from envtf_lit.studies.calibration import CalibrationStudy
+    from envtf_lit.studies.study import run_study
 
-    compare(out, robots=robots, tier=tier, others=others, **training.comparison())
+    run_study(CalibrationStudy(), out, robots=robots, tier=tier, others=others, **training.comparison())
 
 
 def _named_folders(texts: Sequence[str]) -> dict[str, str]:

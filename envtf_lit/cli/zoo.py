@@ -114,7 +114,7 @@ def settle(*, robot: Robot, out: Folder, last: Natural = 3, noise: float = 0.5) 
     from envtf_lit.robots.tasks import ROBOTS
     from envtf_lit.zoo import train as training
 
-    kept = training.settle(ROBOTS[robot], out, last=last, noise=noise)
+    kept = training.average_last_snapshots(ROBOTS[robot], out, last=last, noise=noise)
     score = ROBOTS[robot].normalised_score(kept.mean_return)
     console().print(f"The last snapshot now returns {kept.mean_return:.0f} (score {score:.1f}).")
 

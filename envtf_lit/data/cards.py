@@ -44,7 +44,8 @@ def dataset_card(dataset: OfflineDataset, source: str, origin: dict[str, Any]) -
 
     Returns:
         task, source, transitions, episodes, terminated and truncated episodes, how many of the latter are cut short
-        (and left out of what follows, unless all are), steps per episode, the distribution of their returns,
+        (and left out of what follows, unless all are), steps per episode, the distribution of their returns, the
+        limits of the actions, how many episodes are held out (if that was chosen),
         D4RL-normalised scores where the robot is known (and the source is not Minari, whose sets have no such scores),
         the environment that scores policies, and the origin.
     """
@@ -60,7 +61,11 @@ def dataset_card(dataset: OfflineDataset, source: str, origin: dict[str, Any]) -
         "cut_short": int(cut_short(dataset, source).sum()),
         "episode_steps": {"min": int(lengths.min()), "mean": float(lengths.mean()), "max": int(lengths.max())},
         "returns": distribution(returns),
+        "action_low": dataset.action_low.tolist(),
+        "action_high": dataset.action_high.tolist(),
     }
+    if dataset.held_out is not None:
+        card["held_out_episodes"] = int(dataset.held_out.sum())
     if dataset.task is not None:
         robot = get_task(dataset.task).robot
         card["env_id"] = robot.env_id
@@ -94,7 +99,7 @@ def card_page(card: dict[str, Any]) -> str:
         "steps per episode": f"{steps['mean']:.0f} on average, from {steps['min']:,} to {steps['max']:,}",
         "D4RL-normalised score of its episodes": f"{scores['mean']:.1f} on average, at most {scores['max']:.1f}",
         "seed": card["seed"],
-        "actions": card["actions"],
+        "actions": f"{card['actions']}, in [{min(card['action_low']):g}, {max(card['action_high']):g}]",
         "policies trained with": card["trained_with"],
         "versions": ", ".join(f"{name} {number}" for name, number in card["versions"].items()),
     }

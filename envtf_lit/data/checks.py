@@ -1,15 +1,19 @@
-"""Every check a dataset passes once, on its way in: what comes out is complete, finite and consistent."""
+"""Checks of columns as read from a file, and the `OfflineDataset` made of those that pass."""
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Set
-from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
+import torch
 
+from envtf_lit.data.action_space import discrete, inside, read_limits
 from envtf_lit.data.columns import Column, FileRows, column_blocks, take
 from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
+from envtf_lit.data.findings import Finding
+from envtf_lit.data.statistics import Moments
 from envtf_lit.errors import UserError
 from envtf_lit.robots.tasks import Task, find_task, get_task
 
@@ -25,27 +29,7 @@ RANKS = {
 NUMBERS = ("observations", "actions", "rewards", "next_observations")
 FLAGS = {"terminated": "terminals", "truncated": "timeouts"}  # and what D4RL calls them
 NEEDED = ("observations", "actions", "rewards")
-ACTION_TOLERANCE = 1e-5
-
-Kind = Literal["error", "warning", "note"]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing found in a dataset.
-
-    Attributes:
-        kind: `error` makes it unusable, a `warning` is probably not meant, a `note` says what reading changes.
-        what: as a clause without a full stop, with the values.
-        fix: what to do about it; empty where there is nothing to do.
-    """
-
-    kind: Kind
-    what: str
-    fix: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.what}: {self.fix}" if self.fix else self.what
+ROUNDING = 1e-12  # of a magnitude: what varies less in float64 is rounding itself
 
 
 def build_dataset(
@@ -85,7 +69,7 @@ def examine(
 
     Args:
         columns: arrays, or what has `shape`, `dtype` and slices like one, by the names in `RANKS`.
-        attributes: `task`, `action_low`, `action_high`, each optional.
+        attributes: `task`, `action_low`, `action_high`, `held_out` (E,), each optional.
         task: overrides the name in `attributes`.
         broken: columns that could not be read, by name, and why.
 
@@ -103,13 +87,18 @@ def examine(
     known = _find_task(task, attributes.get("task"), findings)
     if not _check_robot(data, known, findings):
         known = None  # whose action limits mean nothing then
-    low, high = _action_limits(attributes, known, data, findings)
+    low, high = np.zeros((2, 0), np.float32)
     if "actions" in data:
-        data["actions"] = _inside(data["actions"], low, high, findings)
-    starts = np.zeros(0, np.int64)
+        low, high = read_limits(attributes, known, data["actions"], findings)
+        data["actions"] = inside(data["actions"], low, high, findings)
+        findings += discrete(data["actions"])
+    starts, held_out = np.zeros(0, np.int64), None
     if not _failed(findings):
         starts = _find_episodes(data, findings)
+        held_out = _held_out(attributes.get("held_out"), len(starts), findings)
     if not _failed(findings) and "next_observations" not in data:
+        longer = np.diff(starts, append=len(data["rewards"])) > 1  # the others have no row left
+        held_out = None if held_out is None else held_out[longer]
         data, starts = _shift(data, starts, findings)
     if _failed(findings):
         return None, findings
@@ -119,6 +108,7 @@ def examine(
         action_low=low,
         action_high=high,
         task=known.name if known else None,
+        held_out=held_out,
     )
     return dataset, findings
 
@@ -187,7 +177,22 @@ def _read(name: str, values: Any, findings: list[Finding]) -> Column:
                 column[block] = part
     if bad:
         findings.append(_unsound(name, bad, first, np.asarray(values[first : first + 1])))
+    elif dtype is np.float32 and values.dtype.itemsize > 4 and not _failed(findings):
+        findings += _lost_detail(name, values)
     return column
+
+
+def _lost_detail(name: str, values: Any) -> Iterator[Finding]:
+    """Dimensions that vary, but so little beside their magnitude that float32 makes them constant."""
+    width = math.prod(values.shape[1:])
+    parts = (np.asarray(values[block], np.float64).reshape(-1, width) for block in column_blocks(values))
+    found = Moments.of(map(torch.as_tensor, parts))
+    lost = ~found.live & (found.std > ROUNDING * found.largest)
+    for index in lost.nonzero()[:, 0].tolist():
+        where = f" in dimension {index}" if len(values.shape) == 2 else ""
+        size = f"by {found.std[index]:.2g} (standard deviation) around {found.mean[index]:.4g}"
+        fix = "subtract an offset, such as a first value, before you store it"
+        yield Finding("warning", f"{name!r} varies{where} {size}, of which float32 keeps next to nothing", fix)
 
 
 def _one_line(error: Exception) -> str:
@@ -240,42 +245,18 @@ def _check_robot(data: Mapping[str, Column], task: Task | None, findings: list[F
     return found == wanted
 
 
-def _action_limits(
-    attributes: Mapping[str, Any], task: Task | None, data: Mapping[str, Column], findings: list[Finding]
-) -> tuple[np.ndarray, np.ndarray]:
-    if "actions" not in data:
-        return np.zeros(0, np.float32), np.zeros(0, np.float32)
-    action_dim = data["actions"].shape[1]
-    limit = task.robot.action_limit if task else 1.0
-    limits = []
-    for name, default in (("action_low", -limit), ("action_high", limit)):
-        values = np.asarray(attributes.get(name, np.full(action_dim, default)))
-        if values.dtype.kind not in "iuf" or values.shape != (action_dim,) or not np.isfinite(values).all():
-            findings.append(Finding("error", f"{name!r} is {values!s:.80}", f"it must be {action_dim} finite numbers"))
-            values = np.full(action_dim, default)
-        with np.errstate(over="ignore"):
-            limits.append(values.astype(np.float32))
-    low, high = limits
-    if not (np.isfinite(limits).all() and (low < high).all()):
-        findings.append(Finding("error", f"'action_low' {low} is not below 'action_high' {high}", "mend the limits"))
-    return low, high
-
-
-def _inside(actions: Column, low: np.ndarray, high: np.ndarray, findings: list[Finding]) -> Column:
-    """Actions in their space: what lies a rounding error outside is moved to its edge."""
-    first, least, most, over = -1, np.inf, -np.inf, False
-    for block in column_blocks(actions):
-        part = actions[block]
-        outside = ((part < low - ACTION_TOLERANCE) | (part > high + ACTION_TOLERANCE)).any(axis=1)
-        if outside.any() and first < 0:
-            first = block.start + int(outside.argmax())
-        least, most = min(least, part.min()), max(most, part.max())
-        over = over or bool(((part < low) | (part > high)).any())
-    if first >= 0:
-        space = f"outside the action space [{low.min():g}, {high.max():g}], first at row {first}"
-        fix = "rescale them, or store 'action_low' and 'action_high'"
-        findings.append(Finding("error", f"actions reach from {least:g} to {most:g}, {space}", fix))
-    return np.clip(np.asarray(actions), low, high) if over else actions
+def _held_out(stored: Any, episodes: int, findings: list[Finding]) -> np.ndarray | None:
+    """(E,) bool, which episodes the file says are held out; None where it does not say."""
+    if stored is None:
+        return None
+    values = np.asarray(stored)
+    plain = values.dtype.kind in "biuf" and values.shape == (episodes,) and np.isin(values, (0, 1)).all()
+    if not plain or len(np.unique(values)) < 2:
+        what = f"'held_out' has shape {values.shape}, and there are {episodes} episodes"
+        fix = "store for each episode 1 if it is held out and 0 if not, some of both; or leave it out"
+        findings.append(Finding("error", what, fix))
+        return None
+    return values.astype(bool)
 
 
 def _find_episodes(data: dict[str, Any], findings: list[Finding]) -> np.ndarray:

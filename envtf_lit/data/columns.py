@@ -1,14 +1,12 @@
-"""Columns of rows, in memory or in their file, and passes over them that take little memory either way."""
+"""Columns of rows, in memory or in their file, and the blocks in which both are read."""
 
 import os
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from envtf_lit.errors import UserError
 
@@ -105,22 +103,3 @@ def blocks(rows: int, row_bytes: int = 4) -> Iterator[slice]:
 def column_blocks(column: Column) -> Iterator[slice]:
     """`blocks` of this column."""
     return blocks(len(column), column.dtype.itemsize * int(np.prod(column.shape[1:])))
-
-
-def moments(parts: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation (D,) float64 over the rows of all parts (n, D).
-
-    Parts are merged by Chan, Golub & LeVeque (1983), so that the result depends on where they are cut in its last bits
-    alone; columns are always cut by `blocks`, wherever they lie.
-    """
-    count, mean, variance = 0, torch.zeros(()), torch.zeros(())
-    for part in parts:
-        new_variance, new_mean = torch.var_mean(part.double(), dim=0, correction=0)
-        if count == 0:
-            count, mean, variance = len(part), new_mean, new_variance
-            continue
-        share = len(part) / (count + len(part))
-        shift = new_mean - mean
-        variance = variance + share * (new_variance - variance) + share * (1 - share) * shift.square()
-        mean, count = mean + share * shift, count + len(part)
-    return mean, variance.sqrt()

@@ -1,15 +1,26 @@
-"""Datasets from one format to another, and what that changes."""
+"""Conversion of datasets between HDF5, NPZ and Minari, and what that changes."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from envtf_lit.data.checks import Finding, examine
+import numpy as np
+
+from envtf_lit.data.checks import examine
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.findings import Finding
 from envtf_lit.data.sources.files import is_hdf5, save_dataset
 from envtf_lit.data.sources.minari import MINARI, open_source, write_minari
 from envtf_lit.errors import UserError
 
 
-def convert(source: str, target: str, *, task: str | None = None) -> tuple[OfflineDataset, list[Finding]]:
+def convert(
+    source: str,
+    target: str,
+    *,
+    task: str | None = None,
+    action_low: Sequence[float] | None = None,
+    action_high: Sequence[float] | None = None,
+) -> tuple[OfflineDataset, list[Finding]]:
     """Reads a dataset and writes it as something else.
 
     HDF5 and NPZ hold the same columns, bit for bit. Minari keeps T+1 observations of an episode of T steps: where a
@@ -19,6 +30,7 @@ def convert(source: str, target: str, *, task: str | None = None) -> tuple[Offli
         source: an HDF5 or NPZ file, `minari:` and the id of a Minari dataset on this machine, or its folder.
         target: a new file ending in .h5, .hdf5 or .npz, or `minari:` and a new id, such as `minari:my/robot-v0`.
         task: such as `hopper-medium-replay`; None takes the name in the source, where there is one.
+        action_low, action_high: one number, or one for each action dimension; None takes what the source states.
 
     Returns:
         The dataset, and what was changed or left behind.
@@ -31,7 +43,9 @@ def convert(source: str, target: str, *, task: str | None = None) -> tuple[Offli
         is_hdf5(Path(target))
         if Path(target).exists():
             raise UserError(f"{target} exists already: give the new file another name, or delete this one.")
-    dataset, findings = _read(source, task)
+    limits = {"action_low": action_low, "action_high": action_high}
+    stated = {name: np.asarray(values) for name, values in limits.items() if values is not None}
+    dataset, findings = _read(source, task, stated)
     if not to_minari:
         save_dataset(dataset, target)
         return dataset, findings
@@ -39,14 +53,17 @@ def convert(source: str, target: str, *, task: str | None = None) -> tuple[Offli
     if splits:
         what = f"{splits} episodes were split where a next observation is not the following row's: Minari keeps one"
         findings.append(Finding("note", what))
+    if dataset.held_out is not None:
+        what = "which episodes are held out is left behind, for Minari has no place for it"
+        findings.append(Finding("note", what))
     if dataset.task is None:
         findings.append(Finding("note", "no task is named, so that recover_environment() has nothing to make"))
     return dataset, findings
 
 
-def _read(source: str, task: str | None) -> tuple[OfflineDataset, list[Finding]]:
+def _read(source: str, task: str | None, stated: dict[str, np.ndarray]) -> tuple[OfflineDataset, list[Finding]]:
     with open_source(source) as raw:
-        dataset, findings = examine(raw.columns, raw.attributes, task=task, broken=raw.broken)
+        dataset, findings = examine(raw.columns, raw.attributes | stated, task=task, broken=raw.broken)
     if dataset is None:
         worst = next(finding for finding in findings if finding.kind == "error")
         raise UserError(f"{source}: {worst}; `envtf data check` lists all that is wrong.")

@@ -1,15 +1,15 @@
 """The offline dataset: aligned columns of transitions, grouped into episodes, validated once and immutable after."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from envtf_lit.data.columns import Column, column_blocks, moments, take
+from envtf_lit.data.columns import Column, take
+from envtf_lit.data.statistics import DatasetStatistics
 from envtf_lit.errors import UserError
 
 COLUMNS = ("observations", "actions", "rewards", "next_observations", "terminated", "truncated")
@@ -32,6 +32,7 @@ class OfflineDataset:
         episode_starts: (E,) int64, ascending, the first is 0.
         task: the task's name, such as `hopper-medium-replay`, or None where no environment is known.
         action_low, action_high: (A,) float32, the action space.
+        held_out: (E,) bool, the episodes that nothing learns from, some but not all; None where nobody chose them yet.
     """
 
     observations: Column
@@ -44,6 +45,7 @@ class OfflineDataset:
     action_low: np.ndarray
     action_high: np.ndarray
     task: str | None = field(default=None)
+    held_out: np.ndarray | None = field(default=None)
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -80,13 +82,18 @@ class OfflineDataset:
         """(E,) bool, the episodes that terminated or came to a limit of so many steps: others are cut short."""
         return self.terminated[self.episode_ends - 1] | (self.episode_lengths >= limit)
 
-    def observation_scale(self, floor: float = 1e-3) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation (S,) float32 for a policy's inputs; the std is at least `floor`."""
-        mean, std = moments(torch.as_tensor(self.observations[block]) for block in column_blocks(self.observations))
-        return mean.float(), std.clamp(min=floor).float()
+    @cached_property
+    def statistics(self) -> DatasetStatistics:
+        """Means, standard deviations and ranges of the columns."""
+        return DatasetStatistics(self)
+
+    def observation_scale(self) -> tuple[Tensor, Tensor]:
+        """Mean and `Moments.scale` (S,) float32, with which policies z-score their inputs."""
+        observations = self.statistics.observations
+        return observations.mean.float(), observations.scale.float()
 
     def select(self, episodes: Sequence[int] | np.ndarray) -> "OfflineDataset":
-        """The dataset of these episodes, in the order given."""
+        """The dataset of these episodes, in the order given; none of them is marked as held out."""
         episodes = np.asarray(episodes, dtype=np.int64)
         if len(episodes) == 0:
             raise UserError("A dataset needs at least one episode: none was selected.")
@@ -102,19 +109,33 @@ class OfflineDataset:
             task=self.task,
         )
 
-    def split(self, held_out: float, *, seed: int) -> tuple["OfflineDataset", "OfflineDataset"]:
-        """Splits by whole episodes into (training, held-out); at least one episode lands on each side.
+    def with_split(self, share: float, seed: int) -> "OfflineDataset":
+        """The same, with a share of the episodes drawn to be held out; at least one episode lands on each side.
 
         Args:
-            held_out: share of the episodes held out, in (0, 1).
+            share: of the episodes, in (0, 1).
             seed: of the random permutation of the episodes.
         """
         count = len(self.episode_starts)
         if count < 2:
             raise UserError("The dataset has one episode and two are needed, to hold one out: collect more episodes.")
-        order = np.random.default_rng(seed).permutation(count)
-        number = min(max(1, round(held_out * count)), count - 1)
-        return self.select(np.sort(order[number:])), self.select(np.sort(order[:number]))
+        number = min(max(1, round(share * count)), count - 1)
+        held_out = np.zeros(count, bool)
+        held_out[np.random.default_rng(seed).permutation(count)[:number]] = True
+        return replace(self, held_out=held_out)
+
+    def split(self, share: float | None = None, *, seed: int = 0) -> tuple["OfflineDataset", "OfflineDataset"]:
+        """By whole episodes into (training, held-out), each without a split of its own.
+
+        Args:
+            share: as of `with_split`, where the dataset does not say itself which episodes are held out.
+            seed: likewise.
+        """
+        if self.held_out is None:
+            if share is None:
+                raise UserError("The dataset does not say which episodes are held out: give it a split (with_split).")
+            return self.with_split(share, seed).split()
+        return self.select(np.flatnonzero(~self.held_out)), self.select(np.flatnonzero(self.held_out))
 
     def returns_to_go(self, discount: float) -> np.ndarray:
         """(N,) float32, `G_t = r_t + discount * G_{t+1}` to the end of the episode, where G is zero beyond the log.

@@ -1,4 +1,4 @@
-"""What `envtf data check` finds in a dataset: all of its facts and all of its problems at once, never a traceback."""
+"""The report of `envtf data check`: all facts and all problems of a dataset at once, never a traceback."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -6,21 +6,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from envtf_lit.data.checks import Finding, examine
+from envtf_lit.data.checks import examine
 from envtf_lit.data.columns import blocks, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.findings import Finding
 from envtf_lit.data.sources.minari import open_source
+from envtf_lit.data.statistics import CONSTANT
 from envtf_lit.errors import UserError
 from envtf_lit.robots.tasks import get_task
 
 STYLES = {"error": "bold red", "warning": "yellow", "note": "cyan"}  # the gravest first
 BARS = 10  # of the histogram of returns
 MIXER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: odd, and without pattern
-CONSTANT = 1e-6  # a dimension whose range is smaller
 HUGE = 1e8  # a magnitude that float32 arithmetic, which squares, does not go well with
 SEAM = 1e-3  # of a dimension's standard deviation: more between s' and the next row's s is a gap
 
@@ -146,7 +148,8 @@ def _endings(dataset: OfflineDataset) -> Iterator[Finding]:
 
 def _seams(dataset: OfflineDataset) -> Iterator[Finding]:
     """Successors that do not fit the row after: within episodes an end that no flag marks, at ends a shifted column."""
-    scale = SEAM * np.maximum(dataset.observations[: 1 << 16].std(axis=0, dtype=np.float64), CONSTANT)
+    found = dataset.statistics.observations
+    scale = SEAM * torch.maximum(found.std, CONSTANT * found.largest).numpy()
     last = np.zeros(len(dataset), bool)
     last[dataset.episode_ends - 1] = True
     gaps, first, borrowed = 0, -1, 0
@@ -170,17 +173,12 @@ def _seams(dataset: OfflineDataset) -> Iterator[Finding]:
 def _ranges(dataset: OfflineDataset) -> Iterator[Finding]:
     """Dimensions that say nothing, and values that no quantity has."""
     for name in ("observations", "actions", "rewards"):
-        column = getattr(dataset, name)
-        low = np.full(column[:1].size, np.inf)
-        high = -low
-        for block in column_blocks(column):
-            part = column[block].reshape(block.stop - block.start, -1).astype(np.float64)
-            low, high = np.minimum(low, part.min(axis=0)), np.maximum(high, part.max(axis=0))
-        dead = np.flatnonzero(high - low < CONSTANT)
+        found = getattr(dataset.statistics, name)
+        dead = (~found.live).nonzero()[:, 0].numpy()
         if dead.size and name != "rewards":
-            what = f"{dead.size} of {len(low)} dimensions of {name!r} are constant ({_listed(dead)})"
+            what = f"{dead.size} of {len(found.live)} dimensions of {name!r} are constant in float32 ({_listed(dead)})"
             yield Finding("note" if name == "observations" else "warning", what, "leave them out, if they say nothing")
-        most = np.maximum(-low, high)
+        most = found.largest
         if most.max() > HUGE:
             where = f" in dimension {most.argmax()}" if name != "rewards" else ""
             fix = "look for a stand-in for missing values, or change the unit"

@@ -1,22 +1,19 @@
-"""Batches for Lightning: a batch is a draw of row numbers, and the rows come from where they lie.
+"""Lightning data modules and the datasets below them: windows for world models, transitions for agents.
 
-Columns lie on the device as tensors if they fit there; those of a large file stay in it. The batches are the same to
-the bit. Every epoch draws from a generator seeded by (seed, epoch), so a run resumed at an epoch's start sees the same
-rows as one that was never interrupted.
+A batch is a draw of row numbers. Columns lie on the device as tensors if they fit there; those of a large file stay in
+it. The batches are the same to the bit. Every epoch draws from a generator seeded by (seed, epoch), so a run resumed at
+an epoch's start sees the same rows as one that was never interrupted.
 """
 
 from collections.abc import Iterable, Iterator
-from functools import cached_property
 
-import lightning as L
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import Dataset, Sampler
 
 from envtf_lit.data.columns import Column, FileRows, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.sources.files import load_dataset
 
 UPDATES_PER_STEP = 10  # gradient steps of an agent per Lightning training step: no host synchronisation between them
 
@@ -100,7 +97,7 @@ def return_weights(dataset: OfflineDataset, temperature: float) -> Tensor:
     A log that is mostly poor then teaches what its best episodes did; a small temperature means a sharp preference.
     """
     returns = dataset.episode_returns
-    scaled = (returns - returns.min()) / max(returns.max() - returns.min(), 1e-9)
+    scaled = (returns - returns.min()) / (np.ptp(returns) or 1.0)  # 1: all are equal
     return torch.as_tensor(np.exp((scaled - 1.0) / temperature)[dataset.episode_index])
 
 
@@ -187,8 +184,8 @@ class Windows(Dataset[dict[str, Tensor]]):
 class Resamples(Dataset[dict[str, Tensor]]):
     """Bootstrap resamples of windows: as many draws with replacement as there are windows, for each of M members.
 
-    A lone member, who has nobody to differ from, sees every window. Indexed by (M, B) positions, row m within the
-    resample of member m.
+    A single member (M = 1) is given every window once. Indexed by (M, B) positions, row m within the resample of
+    member m.
     """
 
     def __init__(self, windows: Windows, members: int, *, seed: int) -> None:
@@ -238,141 +235,3 @@ class Transitions(Dataset[dict[str, Tensor]]):
     def __getitem__(self, rows: Tensor) -> dict[str, Tensor]:
         rows = rows.to(self.end.device)
         return self.states[rows] | self.following[self.end[rows]] | {name: c[rows] for name, c in self.columns.items()}
-
-
-def _loader(dataset: Dataset[dict[str, Tensor]], draws: Iterable[Tensor]) -> DataLoader[dict[str, Tensor]]:
-    """Batches of whole draws; its own generator, since a DataLoader takes a number from the global one per epoch."""
-    return DataLoader(dataset, sampler=draws, batch_size=None, generator=torch.Generator())
-
-
-def _device(data: L.LightningDataModule) -> torch.device:
-    """Where the trainer works, if there is one."""
-    return torch.device("cpu") if data.trainer is None else data.trainer.strategy.root_device
-
-
-def _process(data: L.LightningDataModule) -> tuple[int, int]:
-    """Which of how many processes this one is."""
-    return (0, 1) if data.trainer is None else (data.trainer.global_rank, data.trainer.world_size)
-
-
-class WindowData(L.LightningDataModule):
-    """Windows for world models, with whole episodes held out for validation.
-
-    Args:
-        path: dataset file, HDF5 or NPZ.
-        context: steps per window; the model's context.
-        batch_size: windows per batch and process.
-        updates_per_epoch: batches per epoch.
-        held_out: share of the episodes kept for validation.
-        seed: of the split and of all draws.
-        members: of an ensemble, each of which has its own bootstrap resample of the training windows; its batches come
-            first in the shape, (members, batch_size, context, …). None gives plain windows.
-    """
-
-    train: OfflineDataset
-    held_out: OfflineDataset
-
-    def __init__(
-        self,
-        path: str,
-        context: int = 32,
-        batch_size: int = 32,
-        updates_per_epoch: int = 1_000,
-        held_out: float = 0.1,
-        seed: int = 0,
-        members: int | None = None,
-    ) -> None:
-        super().__init__()
-        self.path, self.context, self.batch_size, self.members = path, context, batch_size, members
-        self.updates_per_epoch, self.share, self.seed = updates_per_epoch, held_out, seed
-        self.dataset = self.read(path)
-        self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
-
-    def read(self, path: str) -> OfflineDataset:
-        """The dataset of that path; the command line has more sources."""
-        return load_dataset(path)
-
-    def setup(self, stage: str) -> None:
-        """Splits the dataset; called by Lightning."""
-        self.train, self.held_out = self.dataset.split(self.share, seed=self.seed)
-
-    def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """Batches (B, T, …) of `Windows`, or (M, B, T, …) of `Resamples`."""
-        windows = Windows(self.train, self.context, _device(self))
-        shape = (self.batch_size,) if self.members is None else (self.members, self.batch_size)
-        sampler = DrawSampler(len(windows), shape, self.updates_per_epoch, seed=self.seed, process=_process(self))
-        return _loader(windows if self.members is None else Resamples(windows, self.members, seed=self.seed), sampler)
-
-    def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """Each held-out row once; of several processes, every one sees them all."""
-        windows = Windows(self.held_out, self.context, _device(self))
-        return _loader(windows, windows.tiles().split(256))
-
-    def test_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """The same rows as in validation: no third split."""
-        return self.val_dataloader()
-
-    def training_tiles(self, rows: int) -> DataLoader[dict[str, Tensor]]:
-        """Each training row once, or some `rows` of them, drawn as whole windows."""
-        windows = Windows(self.train, self.context)
-        tiles = windows.tiles()
-        order = torch.randperm(len(tiles), generator=epoch_generator(self.seed, 0, "tiles"))
-        kept = max(1, round(len(tiles) * min(1.0, rows / len(self.train))))
-        return _loader(windows, tiles[order[:kept]].split(256))
-
-
-class TransitionData(L.LightningDataModule):
-    """Transitions for agents, several batches at a time.
-
-    Args:
-        path: dataset file, HDF5 or NPZ.
-        batch_size: rows per gradient step and process.
-        steps_per_epoch: Lightning training steps per epoch.
-        discount: of future rewards, per step.
-        n_step: steps whose rewards enter the temporal-difference target.
-        return_temperature: of `return_weights`; None draws rows uniformly.
-        held_out: share of the episodes left out, the ones that `WindowData` holds out with the same share and seed.
-        seed: of the split and of all draws.
-    """
-
-    def __init__(
-        self,
-        path: str,
-        batch_size: int = 256,
-        steps_per_epoch: int = 50,
-        discount: float = 0.99,
-        n_step: int = 1,
-        return_temperature: float | None = None,
-        held_out: float = 0.0,
-        seed: int = 0,
-    ) -> None:
-        super().__init__()
-        self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
-        self.discount, self.n_step, self.seed = discount, n_step, seed
-        self.return_temperature = return_temperature
-        whole = self.read(path)
-        self.dataset = whole.split(held_out, seed=seed)[0] if held_out > 0 else whole
-        self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
-        self.action_low, self.action_high = self.dataset.action_low.tolist(), self.dataset.action_high.tolist()
-
-    def read(self, path: str) -> OfflineDataset:
-        """The dataset of that path; the command line has more sources."""
-        return load_dataset(path)
-
-    @cached_property
-    def transitions(self) -> Transitions:
-        """All rows of the dataset, with their n-step targets and returns to go."""
-        return Transitions(self.dataset, discount=self.discount, n_step=self.n_step, device=_device(self))
-
-    def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """Batches (UPDATES_PER_STEP, batch_size, …) of `Transitions`."""
-        shape = (UPDATES_PER_STEP, self.batch_size)
-        temperature = self.return_temperature
-        weights = None if temperature is None else return_weights(self.dataset, temperature)
-        rows, process = len(self.transitions), _process(self)
-        sampler = DrawSampler(rows, shape, self.steps_per_epoch, seed=self.seed, weights=weights, process=process)
-        return _loader(self.transitions, sampler)
-
-    def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """Each row once, in the log's order, in batches (4096, …)."""
-        return _loader(self.transitions, torch.arange(len(self.transitions)).split(4096))

@@ -1,4 +1,4 @@
-"""The options of the dataset."""
+"""The options of the stage `download`."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -17,7 +17,8 @@ class DownloadOptions:
         path: the HDF5 or NPZ file of `source: file`; of `source: d4rl` a copy of its file, null downloads it.
         minari_id: of `source: minari`, such as `mujoco/hopper/medium-v0`, or its folder.
         transitions: rows to collect from the zoo.
-        held_out: share of the episodes that world models, and without a simulator policies, are not trained on.
+        held_out: share of the episodes that nothing learns from, for validation and evaluation; a file that names its
+            own keeps them.
     """
 
     source: Literal["zoo", "file", "d4rl", "minari"] = "zoo"

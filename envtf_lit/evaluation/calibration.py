@@ -1,8 +1,9 @@
-"""Does a world model know what it does not know?
+"""Calibration of a world model's uncertainty: coverage, proper scores, out-of-distribution detection, rank correlation.
 
-Aleatoric and epistemic spread together are judged by predictive intervals and proper scores on held-out episodes;
-epistemic variance alone by how well it tells strange state-action pairs from familiar ones; the uncertainty u, by which
-imagined rewards are penalised, by whether it is large where the model's own rollouts are wrong, as MuJoCo says.
+Aleatoric and epistemic spread together are measured by predictive intervals and proper scores on held-out episodes;
+epistemic variance alone by how well it tells out-of-distribution state-action pairs from in-distribution ones; the
+uncertainty u, by which imagined rewards are penalised, by its rank correlation with the true error, as MuJoCo tells it,
+along the model's own rollouts.
 """
 
 import math
@@ -14,15 +15,15 @@ import torch
 from torch import Tensor
 
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.statistics import CONSTANT
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.horizon import LARGEST
 from envtf_lit.evaluation.physics import Physics
-from envtf_lit.imagination.histories import BranchPoints
+from envtf_lit.imagination.histories import BranchPoints, Histories
 from envtf_lit.imagination.rollouts import imagine
 from envtf_lit.policy import Policy
 from envtf_lit.world_models.forecast import Forecast, Scale, Trajectories
 from envtf_lit.world_models.interface import WorldModel
-from envtf_lit.world_models.normaliser import CONSTANT
 from envtf_lit.world_models.uncertainty.recalibration import fitted_factor_and_tail, normal_scores
 from envtf_lit.world_models.uncertainty.tails import crps, half_width, log_density
 
@@ -48,7 +49,7 @@ def coverage(teacher_forced: Forecast, trajectories: Trajectories, scale: Scale,
     """Share of recorded outcomes inside the central `level` interval of each one-step prediction.
 
     Args:
-        teacher_forced: forecast of `horizon_report`.
+        teacher_forced: the forecast of `horizon_report` that was shown the true past.
         trajectories: what was forecast.
         scale: says which dimensions are live.
         level: in (0, 1).
@@ -63,9 +64,9 @@ def recalibrated(teacher_forced: Forecast, seen: Forecast, trajectories: Traject
     """A forecast with factors and tails that were fitted to another one of the same model, as the transformer has them.
 
     Args:
-        teacher_forced: what is to be recalibrated.
-        seen: what factors and tails are fitted to, of other episodes.
-        trajectories: what happened in these.
+        teacher_forced: the forecast to be recalibrated.
+        seen: the forecast that factors and tails are fitted to, of other episodes.
+        trajectories: these episodes, as recorded.
     """
     factor, tail = fitted_factor_and_tail(normal_scores(replace(seen, tail=None), trajectories))
     return Forecast(teacher_forced.mean, teacher_forced.std * factor.sqrt().to(teacher_forced.std.dtype), tail)
@@ -73,7 +74,9 @@ def recalibrated(teacher_forced: Forecast, seen: Forecast, trajectories: Traject
 
 @dataclass(frozen=True)
 class ProperScores:
-    """What an honest forecast makes least, per live dimension and outcome, in z-scored units; at most 1e8.
+    """Scores that are least in expectation where the forecast is the true distribution; per live dimension and outcome.
+
+    In z-scored units, at most 1e8.
 
     Attributes:
         nll: mean negative log-density.
@@ -88,7 +91,8 @@ def proper_scores(teacher_forced: Forecast, trajectories: Trajectories, scale: S
     """Scores of one-step predictions at the recorded outcomes, mean over live dimensions and the reward.
 
     Args:
-        teacher_forced: forecast of `horizon_report`; a spread below 1e-6 z-scored units counts as that.
+        teacher_forced: the forecast of `horizon_report` that was shown the true past; a spread counts as at least 1e-6
+            z-scored units.
         trajectories: what was forecast.
         scale: the units, and which dimensions are live.
     """
@@ -104,28 +108,19 @@ def proper_scores(teacher_forced: Forecast, trajectories: Trajectories, scale: S
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """N state-action pairs, each with the real steps that led to it.
+    """N state-action pairs, each with the real steps before it.
 
     Attributes:
-        observations: (N, T, S), right-padded; the last valid one is the state.
-        past_actions: (N, T - 1, A), right-padded.
-        lengths: (N,) valid observations of each row, 1 to T.
+        histories: N, each of which ends with the state of its pair.
         actions: (N, A) of the pairs.
     """
 
-    observations: Tensor
-    past_actions: Tensor
-    lengths: Tensor
+    histories: Histories
     actions: Tensor
 
     def to(self, device: torch.device | str) -> "Points":
         """The same on another device."""
-        return Points(*(column.to(device) for column in (*self.starts, self.actions)))
-
-    @property
-    def starts(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The arguments of `WorldModel.init`."""
-        return self.observations, self.past_actions, self.lengths
+        return Points(self.histories.to(device), self.actions.to(device))
 
 
 def draw_points(dataset: OfflineDataset, count: int, *, history: int, seed: int) -> Points:
@@ -144,8 +139,8 @@ def draw_points(dataset: OfflineDataset, count: int, *, history: int, seed: int)
     if len(late) == 0:
         raise UserError(f"No episode has more than {FIRST_STEPS} steps, and the first {FIRST_STEPS} do not count.")
     rows = np.sort(np.random.default_rng(seed).permutation(late)[:count])
-    starts = BranchPoints(dataset).at(torch.from_numpy(rows), history)
-    return Points(*starts, actions=torch.as_tensor(dataset.actions[rows]))
+    histories = BranchPoints(dataset).at(torch.from_numpy(rows), history)
+    return Points(histories, torch.as_tensor(dataset.actions[rows]))
 
 
 def with_uniform_actions(points: Points, low: np.ndarray, high: np.ndarray, *, seed: int) -> Points:
@@ -158,9 +153,8 @@ def with_uniform_actions(points: Points, low: np.ndarray, high: np.ndarray, *, s
 def novelties(model: WorldModel, points: Points, *, batch_size: int = 1_024) -> np.ndarray | None:
     """(N,) `Prediction.novelty` of each pair, the model shown the true past; None if it has no epistemic variance."""
     found = []
-    for begin in range(0, len(points.actions), batch_size):
-        rows = slice(begin, begin + batch_size)
-        state = model.init(*(column[rows] for column in points.starts))
+    for rows in torch.arange(len(points.actions), device=points.actions.device).split(batch_size):
+        state = points.histories[rows].begin(model)
         _, prediction = model.step(state, points.actions[rows])
         if prediction.novelty is None:
             return None
@@ -168,15 +162,19 @@ def novelties(model: WorldModel, points: Points, *, batch_size: int = 1_024) -> 
     return np.concatenate(found)
 
 
-def auroc(familiar: np.ndarray, strange: np.ndarray) -> float:
-    """Chance that a strange point scores above a familiar one, ties counting half: 0.5 is a guess, 1 is always."""
-    ranks = _ranks(np.concatenate([familiar, strange]))[len(familiar) :]
-    above = ranks.sum() - len(strange) * (len(strange) + 1) / 2
-    return float(above / (len(familiar) * len(strange)))
+def auroc(in_distribution: np.ndarray, out_of_distribution: np.ndarray) -> float:
+    """Area under the ROC curve: the chance that an out-of-distribution point scores above an in-distribution one.
+
+    Ties count half: 0.5 is a guess, 1 is always.
+    """
+    inside, outside = len(in_distribution), len(out_of_distribution)
+    ranks = _ranks(np.concatenate([in_distribution, out_of_distribution]))[inside:]
+    above = ranks.sum() - outside * (outside + 1) / 2
+    return float(above / (inside * outside))
 
 
 def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Spearman's: Pearson's correlation of the ranks, ties sharing their mean rank; 0 where either is constant."""
+    """Spearman's rank correlation: Pearson's of the ranks, ties sharing their mean rank; 0 where either is constant."""
     ranks = np.stack([_ranks(first), _ranks(second)])
     if ranks.size == 0 or (ranks.std(1) == 0).any():
         return 0.0
@@ -189,18 +187,20 @@ def _ranks(values: np.ndarray) -> np.ndarray:
     return pd.Series(values).rank().to_numpy()
 
 
-def roc_curve(familiar: np.ndarray, strange: np.ndarray, points: int = 101) -> tuple[np.ndarray, np.ndarray]:
-    """False and true alarm rates, (points,) each, as the threshold falls from above all familiar scores to below."""
+def roc_curve(
+    in_distribution: np.ndarray, out_of_distribution: np.ndarray, points: int = 101
+) -> tuple[np.ndarray, np.ndarray]:
+    """False and true positive rates, (points,) each, as the threshold falls through the in-distribution scores."""
     false = np.linspace(0.0, 1.0, points)
-    thresholds = np.quantile(familiar, 1.0 - false)
-    true = (strange[None] > thresholds[:, None]).mean(1)
+    thresholds = np.quantile(in_distribution, 1.0 - false)
+    true = (out_of_distribution[None] > thresholds[:, None]).mean(1)
     true[-1] = 1.0
     return false, true
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutErrors:
-    """M imagined steps, each judged by the simulator restarted where the model believed it was.
+    """Uncertainty and true error of M imagined steps, each held against the simulator restarted at the imagined state.
 
     Attributes:
         uncertainty: (M,) the model's u of the step.
@@ -232,14 +232,14 @@ def rollout_errors(
         scale: the units of the error.
         steps: of each rollout, at most.
     """
-    run = imagine(model, policy, starts.starts, horizon=0, tail=steps, terminated=physics.robot.terminated)
-    begun, imagined = (x.double().cpu().numpy() for x in (run.observations, run.next_observations))
-    true, _, _ = physics.step(begun, run.actions.cpu().numpy())
+    run = imagine(model, policy, starts.histories, horizon=0, expansion=steps, terminated=physics.robot.terminated)
+    begun, imagined = (x[run.valid].double().cpu().numpy() for x in (run.observations, run.next_observations))
+    true, _, _ = physics.step(begun, run.actions[run.valid].cpu().numpy())
     live, std = scale.live[:-1].cpu().numpy(), scale.std[:-1].double().cpu().numpy()
     error = np.sqrt(np.square((imagined - true)[:, live] / std[live]).mean(1))
-    uncertainty = run.uncertainty.double().cpu().numpy()
+    uncertainty = run.uncertainty[run.valid].double().cpu().numpy()
     finite = np.isfinite(error) & np.isfinite(uncertainty)
-    clipped = finite & physics.robot.clipped(run.observations).cpu().numpy()
+    clipped = finite & physics.robot.clipped(run.observations[run.valid]).cpu().numpy()
     kept = finite & ~clipped
     depth = physics.depth(begun[kept])
     return RolloutErrors(uncertainty[kept], error[kept], depth, float(1.0 - finite.mean()), float(clipped.mean()))

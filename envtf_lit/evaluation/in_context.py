@@ -1,5 +1,9 @@
-"""Does a model find out which robot it is in? Its errors by how much of an episode it has seen."""
+"""In-context error: a world model's error by the number of steps of the episode that it was shown.
 
+Where a robot's dynamics are hidden, a model with memory errs less the more it has seen.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,8 +20,8 @@ QUANTILES = (0.25, 0.5, 0.75)
 
 
 @dataclass(frozen=True)
-class Recognition:
-    """Lower quartile, median and upper quartile of a model's errors (nmse, see `world_models.horizon`) over stretches.
+class InContextError:
+    """Lower quartile, median and upper quartile of a model's errors (`world_models.forecast.nmse`) over stretches.
 
     Attributes:
         one_step: 3 curves of 32: one step ahead, the c-th after c steps of true history.
@@ -28,13 +32,18 @@ class Recognition:
     open_loop: list[list[float]]
 
     @classmethod
-    def of(cls, one_step: Tensor, open_loop: Tensor) -> "Recognition":
+    def of(cls, one_step: Tensor, open_loop: Tensor) -> "InContextError":
         """From the errors (N, 32) and (N, 25) of N stretches."""
         return cls(*(np.quantile(error.cpu().numpy(), QUANTILES, axis=0).tolist() for error in (one_step, open_loop)))
 
+    @property
+    def summary(self) -> tuple[float, float]:
+        """The medians one step ahead after 16 steps of history, and at the 25th step of the open loop."""
+        return self.one_step[1][HISTORY], self.open_loop[1][-1]
+
 
 def stretches(dataset: OfflineDataset, count: int, *, seed: int) -> Trajectories:
-    """What models are measured on: stretches of whole length from rows drawn at random.
+    """Stretches of 41 steps, from rows drawn at random: the data that in-context errors are measured on.
 
     They start anywhere in an episode, so that a position in the stretch says how much a model has seen, and nothing of
     how long ago the robot was reset.
@@ -45,15 +54,15 @@ def stretches(dataset: OfflineDataset, count: int, *, seed: int) -> Trajectories
     return segments(dataset, count, max(CONTEXT, HISTORY + HORIZON), seed=seed, whole=True)
 
 
-def recognition(model: WorldModel, trajectories: Trajectories, scale: Scale) -> Recognition:
-    """Measures a model on what `stretches` gives, on the same device."""
-    teacher_forced = forecast(model, trajectories, feedback="recorded")
+def in_context_error(model: WorldModel, trajectories: Trajectories, scale: Scale) -> InContextError:
+    """The errors of a model on what `stretches` gives, which is on the model's device."""
+    forced = forecast(model, trajectories, feedback="recorded")
     free = forecast(model, trajectories, feedback="imagined", history=HISTORY)
-    one_step, open_loop = (nmse(run.mean, trajectories, scale) for run in (teacher_forced, free))
-    return Recognition.of(one_step[:, :CONTEXT], open_loop[:, HISTORY : HISTORY + HORIZON])
+    one_step, open_loop = (nmse(run.mean, trajectories, scale) for run in (forced, free))
+    return InContextError.of(one_step[:, :CONTEXT], open_loop[:, HISTORY : HISTORY + HORIZON])
 
 
-def recognition_metrics(found: dict[str, Recognition]) -> dict[str, Any]:
+def in_context_metrics(found: Mapping[str, InContextError]) -> dict[str, Any]:
     """Medians over the stretches, by `model.metric`, and the transformer's as a share of every other model's.
 
     `one_step` is after 16 steps of history, `open_loop` at the 25th step of a model's own after them; `…_by_context`
@@ -61,12 +70,10 @@ def recognition_metrics(found: dict[str, Recognition]) -> dict[str, Any]:
     """
     metrics: dict[str, Any] = {}
     for name, errors in found.items():
-        one_step, open_loop = errors.one_step[1], errors.open_loop[1]
-        metrics[f"{name}.one_step"] = one_step[HISTORY]
-        metrics[f"{name}.open_loop"] = open_loop[-1]
-        metrics[f"{name}.one_step_by_context"] = one_step
-        metrics[f"{name}.open_loop_by_step"] = open_loop
-    for name in found.keys() - {"transformer"}:
+        metrics[f"{name}.one_step"], metrics[f"{name}.open_loop"] = errors.summary
+        metrics[f"{name}.one_step_by_context"] = errors.one_step[1]
+        metrics[f"{name}.open_loop_by_step"] = errors.open_loop[1]
+    for name in (name for name in found if name != "transformer"):
         for kind in ("one_step", "open_loop"):
             metrics[f"transformer.{kind}_vs_{name}"] = metrics[f"transformer.{kind}"] / metrics[f"{name}.{kind}"]
     return metrics

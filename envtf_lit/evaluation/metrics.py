@@ -17,16 +17,15 @@ from envtf_lit.world_models.forecast import Scale
 
 def comparable(
     dataset: OfflineDataset, returns: Mapping[str, Returns], robot: Robot, source: str
-) -> tuple[str, dict[str, np.ndarray]]:
-    """The unit in which policies are compared with the data, and in it each one's episodes (E,), first the `data`'s.
+) -> tuple[str, np.ndarray, dict[str, np.ndarray]]:
+    """The unit in which policies are compared with the data, and in it the data's episodes (E,) and each policy's.
 
     The unit is `score`, D4RL's, or `return` where the data are Minari's, whose sets D4RL's references do not belong to.
     """
     if source in UNSCORED:
         recorded = dataset.episode_returns[counted_episodes(dataset, source)]
-        return "return", {"data": recorded} | {name: found.returns for name, found in returns.items()}
-    scores = {name: found.scores for name, found in returns.items()}
-    return "score", {"data": dataset_scores(dataset, robot, source)} | scores
+        return "return", recorded, {name: found.returns for name, found in returns.items()}
+    return "score", dataset_scores(dataset, robot, source), {name: found.scores for name, found in returns.items()}
 
 
 def world_model_metrics(report: HorizonReport, scale: Scale, *, parameters: int) -> dict[str, Any]:
@@ -73,8 +72,7 @@ def collect_metrics(
         labels: what to call each policy.
         facts: what else stands there: `world_model` and `rollouts`.
     """
-    unit, episodes = comparable(dataset, returns, robot, source)
-    recorded = episodes["data"]
+    unit, recorded, episodes = comparable(dataset, returns, robot, source)
     policies = {
         name: {"label": labels[name]}
         | _spread(unit, episodes[name])
@@ -97,7 +95,7 @@ def _spread(unit: str, values: np.ndarray) -> dict[str, float]:
 def collect_offline_metrics(
     estimates: OfflineEstimates, *, seed: int, dataset: OfflineDataset, labels: Mapping[str, str], **facts: Any
 ) -> dict[str, Any]:
-    """What `reports/metrics.json` holds for a robot without a simulator: no score, and no return that anyone measured.
+    """What `reports/metrics.json` holds for a robot without a simulator: no score, and no measured return.
 
     Args:
         estimates: of each policy.

@@ -1,7 +1,7 @@
-"""What can be said of a policy without its environment: what the model promises it, and how far it agrees with the log.
+"""Estimates of policies without their environment: returns that the world model imagines, and agreement with the log.
 
-An imagined return is the world model's opinion. It is printed beside what the same model says of the recorded actions,
-whose true return the log knows: that difference is how wrong the opinion can be.
+An imagined return is an estimate by the world model. It stands beside the same model's estimate for the recorded
+actions, whose true return the log knows: that difference is how wrong the estimate can be.
 """
 
 from collections.abc import Mapping
@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.horizon import HorizonReport
 from envtf_lit.policy import Policy
@@ -19,12 +18,10 @@ from envtf_lit.world_models.forecast import Trajectories
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.unroll import unroll
 
-LIVE = 1e-6  # an action dimension that varies less has no choice to agree about
-
 
 @dataclass(frozen=True, eq=False)
 class OfflineEstimate:
-    """What is known of one policy without its environment.
+    """The estimate for one policy without its environment.
 
     Attributes:
         returns: (E,) float64, imagined return from the first state of each held-out episode, over as many steps as
@@ -39,11 +36,11 @@ class OfflineEstimate:
 
 @dataclass(frozen=True, eq=False)
 class OfflineEstimates:
-    """What is known of policies without their environment.
+    """The estimates for policies without their environment, and for the recorded actions.
 
     Attributes:
         recorded: (E,) float64, true returns of the held-out episodes.
-        imagined: (E,) float64, what the model, on its own predictions, makes of the same actions.
+        imagined: (E,) float64, returns that the model, on its own predictions, imagines of the recorded actions.
         policies: by name.
     """
 
@@ -55,7 +52,7 @@ class OfflineEstimates:
 def evaluate_offline(
     model: WorldModel, policies: Mapping[str, Policy], report: HorizonReport, training: OfflineDataset
 ) -> OfflineEstimates:
-    """The policies in the world model, and beside the log.
+    """Estimates each policy in the world model, and compares its actions with the log's.
 
     Args:
         model: in eval mode, on the device of the report's trajectories.
@@ -79,9 +76,9 @@ def evaluate_offline(
 
 @torch.no_grad()
 def imagined_returns(model: WorldModel, policy: Policy, held_out: Trajectories, training: OfflineDataset) -> np.ndarray:
-    """(E,) returns of mean predictions under deterministic actions; no rule ends an episode before its recorded end.
+    """Imagined returns (E,): of mean predictions under deterministic actions, each for as long as the record lasted.
 
-    Rewards are cut to the range of the training data's, so that a model that runs away promises no more than was ever
+    Rewards are cut to the range of the training data's, so that a model that runs away imagines no more than was ever
     paid.
     """
     first, no_actions = held_out.observations[:, :1], held_out.actions[:, :0]
@@ -102,8 +99,7 @@ def _bounded(rewards: Tensor, training: OfflineDataset) -> Tensor:
 
 def action_error(policy: Policy, held_out: Trajectories, training: OfflineDataset) -> float:
     """See `OfflineEstimate.action_error`; zero where no action dimension varies."""
-    _, spread = moments(torch.as_tensor(training.actions[rows]) for rows in column_blocks(training.actions))
-    live = spread > LIVE
+    spread, live = training.statistics.actions.std, training.statistics.actions.live
     chosen = policy.act(held_out.observations[held_out.valid], True).cpu().double()
     error = (chosen - held_out.actions[held_out.valid].cpu().double())[:, live] / spread[live]
     return float(error.square().mean()) if bool(live.any()) else 0.0

@@ -1,4 +1,4 @@
-"""MuJoCo restarted at observations: what would really have happened, and the most that any model could foresee.
+"""Physics: MuJoCo restarted at observations, for the true outcome there and the ceiling of any model's horizon.
 
 An observation holds a robot's whole state, but for three things:
 
@@ -151,7 +151,7 @@ def perturbed(trajectories: Trajectories, scale: Scale, size: float, *, seed: in
 
 @dataclass(frozen=True, eq=False)
 class Ceiling:
-    """How long real physics stays near the record when its start is slightly off: more no model can hope for.
+    """Upper bound of any model's length: how long real physics stays near the record when its start is slightly off.
 
     One disturbance, at the start, is all there is; a model errs at every step. So this bounds from above.
 

@@ -1,6 +1,6 @@
-"""How long world models track reality, on episodes that none was trained on, beside how long physics tracks itself.
+"""Tracking: how long a world model's forecasts stay near what really happened, on episodes it was not trained on.
 
-The metric is the paper's (its section on long-horizon rollouts), made definite: see docs/horizon.md.
+The metric is the paper's (its section on long-horizon rollouts), made definite: see docs/metrics.md.
 """
 
 import math
@@ -46,10 +46,10 @@ def fresh_episodes(task: Task, count: int, *, seed: int, workers: int = 1, progr
 
 @dataclass(frozen=True)
 class Tracking:
-    """What is reported of one model on one set of episodes.
+    """Numbers and curves of one model on one set of episodes.
 
     Attributes:
-        numbers: by name; docs/horizon.md explains them.
+        numbers: by name; docs/metrics.md explains them.
         curves: by run (`open_loop`, `teacher_forced`, `ceiling`, `ceiling_typical`): columns of `error_quartiles`, at
             some steps.
     """

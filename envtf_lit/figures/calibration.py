@@ -1,4 +1,4 @@
-"""What models know of their own errors, a row of panels per robot."""
+"""Plots of calibration: coverage, ROC curves and errors along rollouts, a row of panels per robot."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ AXES = {
     "coverage": ("nominal", "observed", "nominal share", "observed share"),
     "errors": ("uncertainty", "median", "uncertainty u (std)", "true error (std)"),
 }
-ROC = ("false", "true", "false alarms", "strange pairs found")
+ROC = ("false", "true", "false positive rate", "true positive rate")
 
 
 def calibration_page(curves: Mapping[str, Mapping[str, Mapping[str, Columns]]], path: str | Path) -> Path:

@@ -19,7 +19,7 @@ from envtf_lit.world_models.forecast import Scale
 
 
 def draw_dataset(dataset: OfflineDataset, source: str, folder: Path) -> None:
-    """`dataset_returns`, of the episodes that count (see `counted_episodes`)."""
+    """Draws `dataset_returns`, of the episodes that count (see `counted_episodes`)."""
     counted = counted_episodes(dataset, source)
     returns, lengths = dataset.episode_returns[counted], dataset.episode_lengths[counted]
     scores.returns_histogram(returns, lengths, folder / "dataset_returns.png")
@@ -28,7 +28,7 @@ def draw_dataset(dataset: OfflineDataset, source: str, folder: Path) -> None:
 def draw_world_model(
     report: HorizonReport, scale: Scale, robot: Robot | None, curves: pd.DataFrame, folder: Path
 ) -> None:
-    """`world_model_curves`, `horizon`, `one_step`, `calibration`, `traces`, and the table `horizon_steps.csv`."""
+    """Draws `world_model_curves`, `horizon`, `one_step`, `calibration`, `traces`, and the table `horizon_steps.csv`."""
     name = robot.name if robot else None
     learning.learning_curves(
         {"world_model": curves}, folder / "world_model_curves.png", title="World model, in training"
@@ -41,14 +41,14 @@ def draw_world_model(
 
 
 def draw_rollouts(rollouts: Rollouts, folder: Path) -> None:
-    """`rollout_uncertainty`, of the stored rollouts."""
+    """Draws `rollout_uncertainty`, of the stored rollouts."""
     step = rollouts.valid.nonzero()[:, 0].numpy()
     uncertainty = rollouts.uncertainty[rollouts.valid].numpy()
     model.rollout_uncertainty(step, uncertainty, folder / "rollout_uncertainty.png")
 
 
 def draw_policy_curves(curves: Mapping[str, pd.DataFrame], labels: Mapping[str, str], folder: Path) -> None:
-    """`policy_curves`, from the curves.csv of each policy."""
+    """Draws `policy_curves`, from the curves.csv of each policy."""
     learning.learning_curves(curves, folder / "policy_curves.png", title="Policies, in training", labels=labels)
 
 
@@ -60,7 +60,7 @@ def draw_scores(
     labels: Mapping[str, str],
     folder: Path,
 ) -> None:
-    """`scores`, of every episode.
+    """Draws `scores`, of every episode.
 
     Args:
         dataset: its episodes stand first.
@@ -70,20 +70,20 @@ def draw_scores(
         labels: what to call each policy.
         folder: to write into.
     """
-    unit, episodes = comparable(dataset, returns, robot, source)
+    unit, recorded, episodes = comparable(dataset, returns, robot, source)
     words = {} if unit == "score" else {"quantity": unit, "title": "Return of every episode"}
-    scores.score_strip(episodes, folder / "scores.png", labels=labels, **words)
+    scores.score_strip({"data": recorded}, episodes, folder / "scores.png", labels=labels, **words)
 
 
 def draw_estimates(estimates: OfflineEstimates, labels: Mapping[str, str], folder: Path) -> None:
-    """`scores`, here of imagined returns, for a robot without a simulator.
+    """Draws `scores`, here of imagined returns, for a robot without a simulator.
 
     Args:
         estimates: of each policy, by name.
         labels: what to call each policy.
         folder: to write into.
     """
-    known = {"recorded": estimates.recorded, "imagined": estimates.imagined}
-    returns = known | {name: estimate.returns for name, estimate in estimates.policies.items()}
-    title = "Recorded returns, and returns in imagination alone"
-    scores.score_strip(returns, folder / "scores.png", labels=labels, quantity="return", title=title)
+    references = {"recorded": estimates.recorded, "imagined": estimates.imagined}
+    returns = {name: estimate.returns for name, estimate in estimates.policies.items()}
+    words = {"quantity": "return", "title": "Recorded and imagined return of every episode"}
+    scores.score_strip(references, returns, folder / "scores.png", labels=labels, **words)

@@ -1,4 +1,4 @@
-"""The picture of a model finding out which robot it is in."""
+"""Plots of in-context errors: by steps of history, and by steps of the open loop after it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from envtf_lit.evaluation.in_context import HISTORY, Recognition
+from envtf_lit.evaluation.in_context import HISTORY, InContextError
 from envtf_lit.figures.style import COLOURS, LABELS, drawing, write_table
 
 PANELS = {
@@ -15,7 +15,7 @@ PANELS = {
 }
 
 
-def recognition_curves(found: Mapping[str, Mapping[str, Recognition]], path: str | Path) -> Path:
+def in_context_curves(found: Mapping[str, Mapping[str, InContextError]], path: str | Path) -> Path:
     """Median errors by history (left) and open loop after it (right), a row for each robot; bands are quartiles.
 
     Args:
@@ -45,7 +45,7 @@ def recognition_curves(found: Mapping[str, Mapping[str, Recognition]], path: str
     return Path(path)
 
 
-def _curves(errors: Recognition) -> dict[str, pd.DataFrame]:
+def _curves(errors: InContextError) -> dict[str, pd.DataFrame]:
     """Quartiles of each kind of error, by steps of history and by steps of the model's own."""
     tables = {}
     for kind, first, (lower, median, upper) in zip(PANELS, (0, 1), (errors.one_step, errors.open_loop), strict=True):

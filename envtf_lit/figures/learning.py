@@ -3,9 +3,12 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from envtf_lit.figures.style import COLOURS, drawing, policy_colours, write_table
@@ -64,18 +67,36 @@ def learning_curves(
     known = sorted(table["quantity"].unique(), key=lambda name: order.index(name) if name in TITLES else len(order))
     curves = [name for name in known if table.loc[table["quantity"] == name, "at"].nunique() > 1]
     quantities = (curves or known)[:MOST_PANELS]  # one point is no curve, and stays in the CSV
-    columns = min(3, len(quantities))
-    rows = math.ceil(len(quantities) / columns)
-    with drawing(path, (4.2 * columns, 2.9 * rows + 0.6), rows, columns) as (figure, axes):
+    rows, columns = _grid(len(quantities))
+    longest = max(len(name) for name in (labels or {}).values() or runs)
+    across = max(1, int(4.2 * columns / (0.6 + 0.09 * longest)))  # legend entries side by side, by their inches
+    height = 2.9 * rows + 0.4 + 0.22 * math.ceil(len(runs) / across)
+    with drawing(path, (4.2 * columns, height), rows, columns) as (figure, axes):
         for axis, quantity in zip(axes.flat, quantities, strict=False):
             _panel(axis, table.loc[table["quantity"] == quantity, :], quantity, labels or {}, tuple(runs))
-        for axis in list(axes.flat)[len(quantities) :]:
-            axis.set_axis_off()
         figure.suptitle(title)
         lines = {line.get_label(): line for axis in axes.flat for line in axis.get_lines()}
-        figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=len(lines))
+        ordered = [label for label in (labels or {}).values() if label in lines]
+        entries = {label: lines[label] for label in [*ordered, *lines]}
+        _legend(figure, list(axes.flat)[len(quantities) :], entries, across)
     write_table(path, table)
     return Path(path)
+
+
+def _grid(panels: int) -> tuple[int, int]:
+    """Rows and columns, three or four of the latter, that leave the fewest places empty."""
+    columns = min(panels, min((3, 4), key=lambda width: -panels % width))
+    return math.ceil(panels / columns), columns
+
+
+def _legend(figure: Figure, empty: list[Axes], lines: Mapping[Any, Artist], across: int) -> None:
+    """The legend of all panels, in the first empty place where there is one."""
+    for axis in empty:
+        axis.set_axis_off()
+    if empty:
+        empty[0].legend(lines.values(), lines.keys(), loc="center")
+    else:
+        figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=min(len(lines), across))
 
 
 def _panel(axis: Axes, lines: pd.DataFrame, quantity: str, labels: Mapping[str, str], runs: tuple[str, ...]) -> None:

@@ -148,7 +148,7 @@ def rollout_uncertainty(step: np.ndarray, uncertainty: np.ndarray, path: str | P
     rows = [(int(s), *np.quantile(uncertainty[step == s], (0.05, 0.25, 0.5, 0.75, 0.95)), int((step == s).sum()))
             for s in np.unique(step)]  # fmt: skip
     table = pd.DataFrame(rows, columns=["step", "q05", "q25", "median", "q75", "q95", "transitions"])
-    with drawing(path, (6.4, 4.0)) as (_, axes):
+    with drawing(path, (7.4, 4.0)) as (figure, axes):
         axis = axes[0, 0]
         x, colour = table["step"] + 1, COLOURS["imagined"]
         axis.fill_between(x, table["q05"], table["q95"], color=colour, alpha=0.15, lw=0, label="5 to 95 %")
@@ -161,7 +161,7 @@ def rollout_uncertainty(step: np.ndarray, uncertainty: np.ndarray, path: str | P
         axis.yaxis.set_minor_formatter(NullFormatter())
         if len(table) <= 20:
             axis.set_xticks(x)
-        axis.legend()
+        figure.legend(loc="outside right upper", fontsize="small")
     write_table(path, table)
     return Path(path)
 

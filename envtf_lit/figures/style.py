@@ -37,8 +37,8 @@ LABELS = {
     "context_1": "transformer, context 1",
     "ensemble": "ensemble",
 }
-# of policies, in the order of params.yaml
-POLICY_COLOURS = ("#E69F00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442")
+# of policies, in the order of params.yaml; none is that of imagination, which stands beside them
+POLICY_COLOURS = ("#E69F00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#8C564B", "#F0E442")
 # of models that have no colour of their own: each colour with the first line style and marker, then with the next
 SPARE = ("#CC79A7", "#E69F00", "#F0E442", "#009E73")
 LINES = (("-", "o"), ("--", "s"), ("-.", "^"), ((0, (1, 1)), "D"))

@@ -127,7 +127,7 @@ class ImaginedBatches(nn.Module):
         """Takes the agent's reward scale, and the stored rollouts into the ring."""
         self.reward_scale.copy_(reward_scale)
         self.ring.count.zero_()
-        self.add_rollouts(self.stored)
+        self.add_rollouts(self.stored, horizon=len(self.stored.valid))  # all of them, whatever the policy's own horizon
 
     def mix(self, batch: Batch, done: int, policy: Policy, generator: torch.Generator) -> Batch:
         """Replaces the last rows of a real batch by imagined ones; `real` (B,) marks what is real.
@@ -139,14 +139,15 @@ class ImaginedBatches(nn.Module):
             generator: of rollouts and rows.
         """
         if self.refresh_every > 0 and done % self.refresh_every == 0:
-            self.add_rollouts(self.imagination.rollouts(policy, generator))
+            rollouts = self.imagination.rollouts(policy, generator)
+            self.add_rollouts(rollouts, horizon=self.imagination.options.horizon)
         kept = round(self.real_ratio * len(batch["real"]))
         imagined = self.ring.draw(len(batch["real"]) - kept, generator)
         imagined["real"] = torch.zeros_like(imagined["rewards"])
         return {name: torch.cat([batch[name][:kept], column]) for name, column in imagined.items()}
 
-    def add_rollouts(self, rollouts: Rollouts) -> None:
-        """Puts the steps up to the horizon into the ring, rewards less the penalty `weight * std(r) * u`."""
+    def add_rollouts(self, rollouts: Rollouts, *, horizon: int) -> None:
+        """Puts the first `horizon` steps into the ring, rewards less the penalty `weight * std(r) * u`."""
         o = self.imagination.options
         rewards = rollouts.rewards - o.penalty * self.imagination.reward_std * rollouts.uncertainty
         rewards = rewards / self.reward_scale
@@ -163,5 +164,5 @@ class ImaginedBatches(nn.Module):
             discounts=weight,
         )
         taken = rollouts.valid.clone()
-        taken[o.horizon :] = False  # what comes after is there for its rewards
+        taken[horizon:] = False  # what comes after is there for its rewards
         self.ring.add({name: column[taken] for name, column in columns.items()})

@@ -37,6 +37,17 @@ class Histories:
         used, window = self.window[rollouts].unique(return_inverse=True)
         return Histories(self.observations[used], self.actions[used], self.lengths[rollouts], window)
 
+    @property
+    def present(self) -> Tensor:
+        """(B, S) the last observation of each."""
+        window = torch.arange(len(self), device=self.lengths.device) if self.window is None else self.window
+        return self.observations[window, self.lengths - 1]
+
+    def to(self, device: torch.device | str) -> "Histories":
+        """The same on another device."""
+        columns = self.observations, self.actions, self.lengths, self.window
+        return Histories(*(column if column is None else column.to(device) for column in columns))  # pyright: ignore[reportArgumentType]
+
     def begin(self, model: WorldModel, *, posterior: float = 0.0, generator: torch.Generator | None = None) -> Any:
         """The model's state after these histories; arguments as of `WorldModel.init`."""
         columns = self.observations, self.actions, self.lengths, self.window

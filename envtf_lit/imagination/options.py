@@ -23,7 +23,7 @@ class GenerateRolloutsOptions:
     """
 
     policy: str = "bc"
-    branches: Count = 4_500
+    branches: Count = 1_000
     horizon: Count = 5
     history: Natural = 4
     exploration: NonNegative = rare(0.1)

@@ -145,9 +145,7 @@ def imagine(
         columns = []
         for step in steps:
             fell = terminated(step.prediction.observation)
-            halted = torch.zeros_like(fell)
-            if novelty_limit is not None:
-                halted = ~fell & (_novelty(step.prediction) > novelty_limit)
+            halted = ~fell & _lost(step.prediction, novelty_limit)
             ended[step.rows] = fell | halted
             columns.append((step, fell, halted))
         parts.append(gather_steps(columns, len(some)))
@@ -177,10 +175,13 @@ def _spread(column: Tensor, rows: Tensor, count: int) -> Tensor:
     return column.new_zeros(count, *column.shape[1:]).index_copy(0, rows, column)
 
 
-def _novelty(prediction: Prediction) -> Tensor:
+def _lost(prediction: Prediction, novelty_limit: float | None) -> Tensor:
+    """(R,) where the model has left what it knows, so far as anyone wants to know."""
+    if novelty_limit is None:
+        return torch.zeros_like(prediction.reward, dtype=torch.bool)
     if prediction.novelty is None:
         raise UserError(
             "novelty_limit is set and the world model has no epistemic variance to hold against it: train a "
             "transformer with epistemic: laplace or an ensemble of several members, or set novelty_limit to null."
         )
-    return prediction.novelty
+    return prediction.novelty > novelty_limit

@@ -59,7 +59,9 @@ def build_tagged(classes: Mapping[str, type[Options]], tag: str, values: Any, se
     if not isinstance(values, Mapping):
         _refuse(section, values, f"a section with the key {tag}")
     if tag not in values:
-        raise UserError(f"{section} has no {tag}: {did_you_mean('', classes)}")
+        raise UserError(
+            f"{section} has no {tag}: add a line such as `{tag}: {next(iter(classes))}` ({' | '.join(classes)})."
+        )
     name = str(values[tag])
     if name not in classes:
         raise UserError(f"{section}.{tag} is {values[tag]!r}: {did_you_mean(name, classes)}")

@@ -1,4 +1,4 @@
-"""The stage `download`: makes, fetches or reads the dataset."""
+"""The stage `download`: makes, fetches or reads the dataset, and chooses the episodes that are held out."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,11 @@ from envtf_lit.robots.tasks import get_task
 
 
 def download(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
-    """Makes or reads the dataset: `data/dataset.h5` and its card, which is returned."""
+    """Makes or reads the dataset, and chooses its held-out episodes: `data/dataset.h5` and its card, which is returned.
+
+    Raises:
+        UserError: the file to be read is the one to be written, the data are bad, or have a single episode.
+    """
     own, target = params.download.path, root / DATASET
     if own is not None and target.exists() and Path(own).exists() and target.samefile(own):
         raise UserError(
@@ -30,7 +34,9 @@ def download(params: Params, root: Path = Path("."), *, progress: bool = True) -
             workers=params.threads,
             progress=progress,
         )
-        save_dataset(dataset, root / DATASET)
+        if dataset.held_out is None:
+            dataset = dataset.with_split(params.download.held_out, params.seed)
+        save_dataset(dataset, target)
         card = dataset_card(dataset, params.download.source, origin)
         write_json(root / CARD, card)
         _write_nothing(root)

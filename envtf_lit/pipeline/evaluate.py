@@ -5,6 +5,7 @@ from typing import Any
 
 import pandas as pd
 
+from envtf_lit.agents.options import NO_WORLD_MODEL
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
@@ -53,13 +54,13 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         dataset, rollouts = load_dataset(root / DATASET), load_rollouts(rollouts_file(root, name))
         folder = root / WORLD_MODELS / name
         model = load_world_model(folder)
-        training, held_out = dataset.split(params.download.held_out, seed=params.seed)
+        training, held_out = dataset.split()
         _, held_out = calibration_split(held_out)
         scale = Scale.of(training)
         report = horizon_report(model, whole_episodes(held_out, options.trajectories, seed=params.seed), scale)
         policies = {policy: load_policy(root / POLICIES / policy) for policy in params.train_policy}
         curves = {policy: _curves(root / POLICIES / policy) for policy in policies}
-        facts = dict(
+        facts: dict[str, Any] = dict(
             seed=params.seed,
             dataset=dataset,
             world_model={"name": name}
@@ -91,6 +92,9 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
                 gallery.draw_scores(dataset, source, robot, returns, _labels(params), plots)
                 episode, gif = list(returns.values())[-1].median, video / "real_vs_imagined.gif"
                 real_vs_imagined(model, episode, robot, scale, gif, frames=options.video_frames)
+        for policy, options in params.train_policy.items():
+            imagined_in = None if options.world_model == NO_WORLD_MODEL else options.world_model
+            metrics["policies"][policy] |= {"algorithm": algorithm_of(options), "world_model": imagined_in}
         write_json(root / METRICS, metrics)
     return metrics
 

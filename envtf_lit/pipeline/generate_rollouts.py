@@ -49,7 +49,6 @@ def generate_rollouts(
     name = one_of("train_model", params.train_model, name)
     target = rollouts_file(root, name)
     with run_stage(f"generate_rollouts_{name}", params, root):
-        check_writable(target, folder=False)
         rollouts = _imagine(params, root, name)
         settings = run_settings(params, params.generate_rollouts)
         save_rollouts(rollouts, target, provenance=settings | {"task": params.task, "world_model": name})
@@ -69,6 +68,7 @@ def _imagine(params: Params, root: Path, name: str) -> Rollouts:
     generator = torch.Generator(device).manual_seed(params.seed)
     points = BranchPoints(load_dataset(root / DATASET), device)
     histories = points.draw_stretches(options.branches, options.history, STRETCH, generator)
+    check_writable(rollouts_file(root, name), folder=False)  # only now: a refused call leaves no folder
     begin = time.perf_counter()
     with autocast(device, params.precision):
         rollouts = imagine(

@@ -1,6 +1,7 @@
 """The schema of `params.yaml`: every option of every stage, and the rules that tie options of several stages."""
 
 import dataclasses
+import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -89,6 +90,9 @@ def build_params(values: Mapping[str, Any]) -> Params:
     named = {name: tree.pop(name) for name in ("train_model", "train_policy") if name in tree}
     sections = {name: build(type_, tree.pop(name), name) for name, type_ in _sections() if name in tree}
     params = dataclasses.replace(build(Params, tree, ""), **sections)
+    if params.download.path is not None:  # no shell does it for a file's `~`
+        own = dataclasses.replace(params.download, path=os.path.expanduser(params.download.path))
+        params = dataclasses.replace(params, download=own)
     if "train_model" in named:
         models = {name: build_tagged(KINDS, "kind", item, key) for name, key, item in _named("train_model", named)}
         params = dataclasses.replace(params, train_model=models)
@@ -115,7 +119,7 @@ def _named(stage: str, sections: Mapping[str, Any]) -> Iterator[tuple[str, str, 
         raise UserError(f"{stage} is {below!r}, expected one section or more, each with a name of its own.")
     for name, values in below.items():
         if not NAME.fullmatch(str(name)) or name == NO_WORLD_MODEL:
-            raise UserError(f"{stage}.{name} cannot be called so: take letters, digits, _ and -, and not 'none'.")
+            raise UserError(f"{stage} has a section {name!r}: name it with letters, digits, _ and -, and not 'none'.")
         yield str(name), f"{stage}.{name}", values
 
 
@@ -129,8 +133,15 @@ def _policies(common: CommonOptions, sections: Mapping[str, Any]) -> Iterator[tu
 
 
 def algorithm_of(options: PolicyOptions) -> str:
-    """The name of the algorithm that has these options."""
-    return next(name for name, algorithm in ALGORITHMS.items() if algorithm.Options is type(options))
+    """The name of the algorithm that has these options.
+
+    Raises:
+        UserError: several have them.
+    """
+    found = [name for name, algorithm in ALGORITHMS.items() if algorithm.Options is type(options)]
+    if len(found) > 1:  # one would be trained in place of the other
+        raise UserError(f"{' and '.join(found)} have {type(options).__name__} in common: give each options of its own.")
+    return found[0]
 
 
 def kind_of(options: WorldModelOptions) -> str:
@@ -167,14 +178,14 @@ def check_rules(params: Params) -> None:
         _check_history("generate_rollouts", first.history, name, model)
         _check_epistemic("generate_rollouts.novelty_limit", first.novelty_limit, name, model)
     one_of("train_model", params.train_model, params.evaluate.world_model)
+    for name, policy in params.train_policy.items():
+        _check_policy(f"train_policy.{name}", policy, params)
     one_of("train_policy", params.train_policy, first.policy)
     if params.train_policy[first.policy].world_model != NO_WORLD_MODEL:
         raise UserError(
             f"generate_rollouts.policy is {first.policy}, which itself learns from imagined rollouts: name one from "
             "data alone, such as bc."
         )
-    for name, policy in params.train_policy.items():
-        _check_policy(f"train_policy.{name}", policy, params)
 
 
 def _check_policy(section: str, options: PolicyOptions, params: Params) -> None:

@@ -1,4 +1,4 @@
-"""Where datasets come from."""
+"""The dataset of each `download.source`: the zoo, D4RL, Minari or a file."""
 
 from dataclasses import replace
 from pathlib import Path

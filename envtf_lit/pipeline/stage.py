@@ -17,6 +17,7 @@ from envtf_lit.pipeline.params import Params
 from envtf_lit.robots.tasks import Robot, get_task
 from envtf_lit.world_models.options import WorldModelOptions
 
+SOURCE = Path("data/source.json")
 DATASET, CARD = Path("data/dataset.h5"), Path("data/dataset.json")
 WORLD_MODELS, POLICIES = Path("models/world_model"), Path("models/policy")  # a folder below for each name
 ROLLOUTS = Path("data/rollouts")  # a file below for each world model
@@ -44,7 +45,7 @@ def unseen(params: Params) -> dict[str, float]:
 def run_settings(params: Params, options: WorldModelOptions | PolicyOptions | Any) -> dict[str, Any]:
     """What a run's result depends on, beside its input files."""
     common = {name: getattr(params, name) for name in ("seed", "threads", "precision", "compile")}
-    return common | {"held_out": params.download.held_out, "options": asdict(options)}
+    return common | {"options": asdict(options)}
 
 
 @contextlib.contextmanager

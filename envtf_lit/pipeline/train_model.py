@@ -32,7 +32,6 @@ def train_model(
             options,
             root / DATASET,
             root / WORLD_MODELS / name,
-            held_out=params.download.held_out,
             seed=params.seed,
             precision=params.precision,
             compile=params.compile,

@@ -6,8 +6,9 @@ from typing import Any
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.agents.store import publish_policy
+from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import UPDATES_PER_STEP, TransitionData, return_weights
+from envtf_lit.data.loaders import UPDATES_PER_STEP, return_weights
 from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.params import Params, algorithm_of, one_of

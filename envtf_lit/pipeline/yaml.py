@@ -17,6 +17,7 @@ from ruamel.yaml.error import YAMLError
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.options.schema import kind, options_class
+from envtf_lit.pipeline.former import refuse_former
 from envtf_lit.pipeline.params import COMMON, Params, algorithm_of, build_params, kind_of
 from envtf_lit.world_models.options import KINDS
 
@@ -42,8 +43,12 @@ def load_params(path: str | Path = "params.yaml", overrides: Sequence[str] = ())
         raise UserError(f"Cannot read {path} ({error}): give a YAML file.") from None
     try:
         values = _parse(text, str(path)) or {}
+        if not isinstance(values, Mapping):
+            raise UserError(f"the file holds {values!r}, expected a section of options, such as `seed: 0`.")
         missing = {name: dump_params(Params())[name] for name in NAMED if name not in values}
-        return build_params(_overlay({**values, **missing}, *map(_override, overrides)))
+        tree = _overlay({**values, **missing}, *map(_override, overrides))
+        refuse_former(tree)
+        return build_params(tree)
     except UserError as error:
         raise UserError(f"{path}: {error}" if not overrides else str(error)) from None
 
@@ -154,7 +159,7 @@ def _override(text: str) -> dict[str, Any]:
     """`a.b=1` as {"a": {"b": 1}}."""
     key, equals, value = text.partition("=")
     if not equals or not key:
-        raise UserError(f"{text!r} is not an override: write key=value, such as train_model.updates=500.")
+        raise UserError(f"{text!r} is not an override: write key=value, such as policy.updates=9000.")
     tree: Any = _parse(value, f"The value of {key}")
     for name in reversed(key.split(".")):
         tree = {name: tree}

@@ -80,21 +80,12 @@ def _write_pipeline(source: Path, target: Path) -> None:
     yaml.indent(mapping=2, sequence=4, offset=2)
     pipeline = yaml.load(source)
     for stage in pipeline["stages"].values():
-        slots = {slot for item in stage.get("foreach", {}).values() for slot in item if _is_code(item[slot])}
-        for item in stage.get("foreach", {}).values():
-            for slot in slots:
-                del item[slot]
         stage = stage.get("do", stage)
-        ours = {f"${{item.{slot}}}" for slot in slots}
-        stage["deps"] = [path for path in stage["deps"] if path not in ours and not _is_code(path)]
+        stage["deps"] = [path for path in stage["deps"] if not path.startswith("envtf_lit/")]
         if not stage["deps"]:
             del stage["deps"]
     with replacing(target) as temporary:
         yaml.dump(pipeline, temporary)
-
-
-def _is_code(path: str) -> bool:
-    return path.startswith("envtf_lit/")
 
 
 def _in_git(folder: Path) -> bool:

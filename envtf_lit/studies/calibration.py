@@ -1,14 +1,13 @@
-"""`envtf calibrate`: what models know of their own errors, for several robots, into one JSON, a table and a figure."""
+"""The study `envtf calibrate`: calibration of world models' uncertainty, and detection of out-of-distribution data."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-import torch
 
 from envtf_lit.data.cards import markdown_table
 from envtf_lit.data.dataset import OfflineDataset
@@ -27,31 +26,20 @@ from envtf_lit.evaluation.calibration import (
 )
 from envtf_lit.evaluation.physics import Physics
 from envtf_lit.figures.calibration import calibration_page
-from envtf_lit.files import write_json, write_text
-from envtf_lit.results import claim
+from envtf_lit.files import write_text
 from envtf_lit.robots.returns import SEED_OFFSET
-from envtf_lit.robots.tasks import Task, get_task
-from envtf_lit.studies.suite import (
-    MODELS,
-    WORK,
-    Suite,
-    SuiteOptions,
-    build_suite,
-    flat_settings,
-    heading,
-    kept,
-    measurable,
-    other_folders,
-)
+from envtf_lit.robots.tasks import Task
+from envtf_lit.studies.study import Study
+from envtf_lit.studies.suite import MODELS, Suite, cached_result, flat_settings, load_for_study
 from envtf_lit.training import pick_device
 from envtf_lit.world_models.forecast import Scale, forecast, whole_episodes
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.zoo.collect import collect
 from envtf_lit.zoo.snapshots import load_snapshot, read_series
 
-CONTRASTS = ("expert", "random_policy", "random_action")  # what is strange to a model of medium data
+CONTRASTS = ("expert", "random_policy", "random_action")  # pairs that medium data hardly hold
 LEVELS = (0.05, *(k / 10 for k in range(1, 10)), 0.95)  # at which coverage is drawn
-FORMAT = 2  # of kept results; those of before lack numbers and are measured anew
+FORMAT = 3  # of cached results; those of before lack numbers, or name them otherwise, and are measured anew
 PARTS = 20  # of a rollout's steps in order of u, at which errors are drawn
 
 Curves = dict[str, dict[str, list[float]]]  # by kind: named columns
@@ -60,18 +48,18 @@ Measured = tuple[dict[str, float], Curves]
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """What is measured.
+    """The numbers of pairs, episodes and rollouts that models are measured on.
 
     Attributes:
         points: state-action pairs of each kind, or as many as there are.
-        strange_rows: transitions collected to draw those of the expert and of the random policy from.
+        out_of_distribution_rows: transitions collected to draw the expert's and the random policy's pairs from.
         episodes: held-out ones that intervals are judged on, at most.
         rollouts: of the model, under the expert.
         rollout_steps: of each, at most.
     """
 
     points: int = 4_000
-    strange_rows: int = 20_000
+    out_of_distribution_rows: int = 20_000
     episodes: int = 50
     rollouts: int = 200
     rollout_steps: int = 25
@@ -79,7 +67,7 @@ class CalibrationOptions:
 
 @dataclass(frozen=True)
 class Findings:
-    """What is reported of one model on one robot.
+    """Numbers and curves of one model on one robot.
 
     Attributes:
         numbers: by name; docs/calibration.md explains them.
@@ -90,102 +78,62 @@ class Findings:
     curves: Curves
 
 
-Results = dict[str, Findings]  # of a robot, by model
+Found = Mapping[str, Mapping[str, Findings]]  # by robot and model
 
 
-def compare(
-    out: Path,
-    *,
-    robots: Sequence[str],
-    tier: str = "medium",
-    work: Path = WORK,
-    options: SuiteOptions,
-    measured: CalibrationOptions = CalibrationOptions(),
-    others: Mapping[str, str] | None = None,
-    progress: bool = True,
-    report: Callable[[str], None] = print,
-) -> dict[str, Any]:
-    """Measures every model on every robot; what an interrupted call has measured is kept below `work`.
+@dataclass(frozen=True)
+class CalibrationStudy(Study[Findings]):
+    """Coverage, proper scores, detection of new data, and errors along own rollouts, of each model."""
 
-    Args:
-        out: JSON file to write after each robot, with flat keys; a table `.md` and a figure `.png` appear beside it.
-        robots: names.
-        tier: of the data that the models are trained on.
-        work: where datasets, models and results are kept, as `build_suite` has it.
-        options: how the models are trained.
-        measured: what is measured of them.
-        others: further models, name to folder; `{task}` and `{robot}` in a folder stand for those names.
-        progress: shows bars.
-        report: called with a line for each robot.
+    options: CalibrationOptions = CalibrationOptions()
+    prefix: ClassVar[str] = "calibration"
+    mark: ClassVar[str] = "calibration.points"
 
-    Returns:
-        What `out` holds.
+    def measure(
+        self, task: Task, suite: Suite, others: Mapping[str, Path], progress: bool
+    ) -> Iterator[tuple[str, Findings]]:
+        data = cache(
+            partial(CalibrationData, task, suite, self.options, progress)
+        )  # made for the first that is measured
+        settings = flat_settings(task.tier, suite.options, calibration=self.options) | {"format": FORMAT}
 
-    Raises:
-        UserError: an unknown robot or tier, a folder without a world model of the robot, a name that is taken, or
-            a file in the way that is none of this command's.
-    """
-    tasks = [get_task(f"{robot}-{tier}") for robot in dict.fromkeys(robots)]
-    further = other_folders(others or {}, tasks)
-    claim(out, "calibration.points", [out.with_suffix(ending) for ending in (".md", ".png", ".csv")])
-    torch.set_num_threads(options.threads)
-    found: dict[str, Results] = {}
-    numbers = heading(tier, options, calibration=measured)
-    for task in tasks:
-        name = task.robot.name
-        built = build_suite(task.name, work, options, progress=progress)
-        found[name] = measure(task, built, work / task.name, measured, others=further[task.name], progress=progress)
-        numbers |= built.costs | flat_numbers({name: found[name]})
-        write_json(out, numbers)
+        def one(folder: Path) -> dict[str, Any]:
+            points = data()
+            begin = time.perf_counter()
+            findings = points.measure(load_for_study(folder, suite.options))
+            return asdict(findings) | {"numbers": findings.numbers | {"seconds": round(time.perf_counter() - begin, 1)}}
+
+        for name, folder in (suite.folders | dict(others)).items():
+            inputs = [suite.dataset, folder]
+            found = cached_result(suite.home, f"calibration-{name}", settings, inputs, partial(one, folder))
+            yield name, Findings(**found)
+
+    def headline(self, finding: Findings) -> str:
+        numbers = finding.numbers
+        areas = ", ".join(_shown(numbers, f"auroc_{name}", 2) for name in CONTRASTS)
+        return (
+            f"50 % intervals hold {numbers['coverage_50']:.1%}, 90 % intervals {numbers['coverage_90']:.1%}; AUROC "
+            f"{areas}; rank correlation {numbers['rank_correlation']:.2f}, above ground "
+            f"{numbers['rank_correlation_above_ground']:.2f}"
+        )
+
+    def numbers(self, findings: Mapping[str, Findings]) -> dict[str, float]:
+        """`model.name`, and `coverage_50` and `coverage_90` of the transformer, if it was measured."""
+        found = {f"{model}.{name}": value for model, one in findings.items() for name, value in one.numbers.items()}
+        levels = ("coverage_50", "coverage_90") if MODELS[0] in findings else ()
+        return found | {level: findings[MODELS[0]].numbers[level] for level in levels}
+
+    def beside(self, out: Path) -> list[Path]:
+        return [out.with_suffix(ending) for ending in (".md", ".png", ".csv")]
+
+    def show(self, found: Found, tier: str, out: Path) -> None:
         write_text(out.with_suffix(".md"), page(found, tier))
         curves = {robot: {model: one.curves for model, one in results.items()} for robot, results in found.items()}
         calibration_page(curves, out.with_suffix(".png"))
-        report(f"{name}: {_headline(found[name])} ({len(found)} of {len(tasks)})")
-    return numbers
 
 
-def measure(
-    task: Task, suite: Suite, home: Path, options: CalibrationOptions, *, others: Mapping[str, Path], progress: bool
-) -> Results:
-    """Everything about one robot's models, on the same episodes, pairs and first states for each.
-
-    Args:
-        task: robot and tier that the models were trained on.
-        suite: data and models.
-        home: below it lies what was measured before of the same models.
-        options: what is measured.
-        others: folders of further models, by name.
-        progress: shows bars while strange data are collected.
-    """
-    course = cache(partial(Course, task, suite, options, progress))
-    settings = flat_settings(task.tier, suite.options, calibration=options)
-    settings["format"] = FORMAT
-
-    def one(folder: Path) -> dict[str, Any]:
-        place = course()
-        begin = time.perf_counter()
-        findings = place.measure(measurable(folder, suite.options))
-        return asdict(findings) | {"numbers": findings.numbers | {"seconds": round(time.perf_counter() - begin, 1)}}
-
-    return {
-        name: Findings(**kept(home, f"calibration-{name}", settings, [suite.dataset, folder], partial(one, folder)))
-        for name, folder in (suite.folders | dict(others)).items()
-    }
-
-
-def flat_numbers(found: Mapping[str, Results]) -> dict[str, float]:
-    """`robot.model.name`, and `robot.coverage_50` and `_90` of the model that this package is about."""
-    numbers = {}
-    for robot, results in found.items():
-        for model, findings in results.items():
-            numbers |= {f"{robot}.{model}.{name}": value for name, value in findings.numbers.items()}
-        for level in (50, 90):
-            numbers[f"{robot}.coverage_{level}"] = results[MODELS[0]].numbers[f"coverage_{level}"]
-    return numbers
-
-
-class Course:
-    """What a robot's models are measured on.
+class CalibrationData:
+    """The held-out episodes, state-action pairs and starts of rollouts that a robot's models are measured on.
 
     Args:
         task: robot and tier.
@@ -207,24 +155,24 @@ class Course:
         def pairs(dataset: OfflineDataset, count: int = options.points, *, stream: int = 0) -> Points:
             return draw_points(dataset, count, history=history, seed=seed + stream)
 
-        self.familiar = pairs(held_out)
+        self.in_distribution = pairs(held_out)
         low, high = held_out.action_low, held_out.action_high
-        self.strange = {
+        self.out_of_distribution = {
             name: pairs(
                 collect(
                     Task(task.robot, tier),
-                    options.strange_rows,
+                    options.out_of_distribution_rows,
                     seed=seed + SEED_OFFSET,
                     workers=suite.options.threads,
                     progress=progress,
                 )
             )
             for name, tier in (("expert", "expert"), ("random_policy", "random"))
-        } | {"random_action": with_uniform_actions(self.familiar, low, high, seed=seed)}
+        } | {"random_action": with_uniform_actions(self.in_distribution, low, high, seed=seed)}
         series = read_series(task.robot)
         self.starts, self.physics = pairs(held_out, options.rollouts, stream=1), Physics(task.robot)
         self.expert = load_snapshot(series, series.expert.steps).to(self.device)
-        real = self.familiar.observations[torch.arange(len(self.familiar.lengths)), self.familiar.lengths - 1]
+        real = self.in_distribution.histories.present
         self.deepest = float(self.physics.depth(real.cpu().numpy()).max())
 
     def measure(self, model: WorldModel) -> Findings:
@@ -238,29 +186,27 @@ class Course:
 
     def intervals(self, model: WorldModel) -> Measured:
         """Coverage and proper scores on held-out episodes."""
-        teacher_forced = forecast(model, self.episodes, feedback="recorded")
-        covered = {
-            round(100 * level): coverage(teacher_forced, self.episodes, self.scale, level).mean for level in LEVELS
-        }
+        forced = forecast(model, self.episodes, feedback="recorded")
+        covered = {round(100 * level): coverage(forced, self.episodes, self.scale, level).mean for level in LEVELS}
         curve = {"nominal": [level / 100 for level in covered], "observed": list(covered.values())}
         numbers = {f"coverage_{level}": covered[level] for level in (50, 90)}
-        numbers |= asdict(proper_scores(teacher_forced, self.episodes, self.scale))
+        numbers |= asdict(proper_scores(forced, self.episodes, self.scale))
         if self.calibrating is not None:  # models that were not recalibrated are, all by the same rule
             seen = forecast(model, self.calibrating, feedback="recorded")
-            fitted = proper_scores(recalibrated(teacher_forced, seen, self.calibrating), self.episodes, self.scale)
+            fitted = proper_scores(recalibrated(forced, seen, self.calibrating), self.episodes, self.scale)
             numbers |= {f"fitted_{name}": value for name, value in asdict(fitted).items()}
         return numbers, {"coverage": curve}
 
     def detection(self, model: WorldModel) -> Measured:
-        """Strange pairs against familiar ones, by epistemic variance; nothing of a model that has none."""
-        known = novelties(model, self.familiar.to(self.device))
+        """Out-of-distribution pairs against held-out ones, by epistemic variance; nothing of a model that has none."""
+        inside = novelties(model, self.in_distribution.to(self.device))
         numbers, curves = {}, {}
-        for contrast, points in self.strange.items():
+        for contrast, points in self.out_of_distribution.items():
             scores = novelties(model, points.to(self.device))
-            if known is None or scores is None:
+            if inside is None or scores is None:
                 continue
-            numbers[f"auroc_{contrast}"] = auroc(known, scores)
-            false, true = roc_curve(known, scores)
+            numbers[f"auroc_{contrast}"] = auroc(inside, scores)
+            false, true = roc_curve(inside, scores)
             curves[f"roc_{contrast}"] = {"false": false.tolist(), "true": true.tolist()}
         return numbers, curves
 
@@ -272,7 +218,7 @@ class Course:
         numbers = {
             "rank_correlation": rank_correlation(run.uncertainty, run.error),
             "rank_correlation_above_ground": rank_correlation(run.uncertainty[above], run.error[above]),
-            "sunk": int((~above).sum()) / max(1, len(above)),
+            "below_ground": int((~above).sum()) / max(1, len(above)),
             "given_up": run.given_up,
             "clipped": run.clipped,
         }
@@ -286,31 +232,20 @@ def _quantiles(uncertainty: np.ndarray, error: np.ndarray) -> dict[str, list[flo
     return dict(zip(("uncertainty", "lower", "median", "upper"), np.reshape(rows, (-1, 4)).T.tolist(), strict=True))
 
 
-def _headline(results: Results) -> str:
-    ours, theirs = (results[name].numbers for name in ("transformer", "ensemble"))
-    areas = (f"{_shown(ours, f'auroc_{name}', 2)} ({_shown(theirs, f'auroc_{name}', 2)})" for name in CONTRASTS)
-    return (
-        f"50 % intervals hold {ours['coverage_50']:.1%}, 90 % intervals {ours['coverage_90']:.1%}; AUROC (the "
-        f"ensemble's) {', '.join(areas)}; rank correlation {ours['rank_correlation']:.2f} "
-        f"({theirs['rank_correlation']:.2f}), above ground {ours['rank_correlation_above_ground']:.2f} "
-        f"({theirs['rank_correlation_above_ground']:.2f})"
-    )
-
-
 def _shown(numbers: Mapping[str, float], name: str, digits: int = 3) -> str:
     return f"{numbers[name]:.{digits}f}" if name in numbers else "–"
 
 
 HEAD = (
     "robot", "model", "50 % interval", "90 % interval", "NLL", "NLL, fitted", "CRPS", "CRPS, fitted",
-    "expert", "random policy", "random action", "own rollouts", "above ground", "sunk",
+    "expert", "random policy", "random action", "own rollouts", "above ground", "below ground",
 )  # fmt: skip
 
 
-def page(found: Mapping[str, Results], tier: str) -> str:
-    """The table in Markdown."""
+def page(found: Found, tier: str) -> str:
+    """The Markdown page: a row per robot and model."""
     detected = (f"auroc_{name}" for name in CONTRASTS)
-    ranked = ("rank_correlation", "rank_correlation_above_ground", "sunk")
+    ranked = ("rank_correlation", "rank_correlation_above_ground", "below_ground")
     names = ("coverage_50", "coverage_90", "nll", "fitted_nll", "crps", "fitted_crps", *detected, *ranked)
     rows = [
         (robot, model, *(_shown(findings.numbers, name) for name in names))

@@ -1,4 +1,4 @@
-"""`envtf bench cost`: seconds and memory that each world model takes to reach the same error on held-out episodes.
+"""The benchmark `envtf bench cost`: seconds and memory of each world model to reach the same held-out error.
 
 The transformer, the ensemble, and one plain network with as many parameters as the transformer, each trained in a
 process of its own by the recipe of its kind.
@@ -21,12 +21,12 @@ from envtf_lit.files import write_json
 from envtf_lit.results import claim
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.studies.machine import facts
-from envtf_lit.studies.suite import WORK, SuiteOptions, build_suite, model_params
+from envtf_lit.studies.suite import WORK, SuiteOptions, build_suite, model_options
 from envtf_lit.training import pick_device, run_folder, trained
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.forecast import Scale, forecast, nmse, segments
 from envtf_lit.world_models.lit import lit_world_model, window_data
-from envtf_lit.world_models.options import TrainModelOptions
+from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 MODELS = ("transformer", "ensemble", "mlp")
@@ -63,7 +63,7 @@ def bench_cost(
     if out is not None:
         claim(out, "target_error")
     for name in ("transformer", "ensemble"):
-        model_params(name, task, options)  # what is wrong with the options shows before any work
+        model_options(name, options)  # what is wrong with the options shows before any work
     dataset = build_suite(task, work, options, models=(), progress=progress).dataset
     trials = {name: _apart(name, task, dataset, work, options, progress) for name in models}
     target = max(trial["best_error"] for trial in trials.values())
@@ -90,10 +90,11 @@ def _trial(name: str, task: str, dataset: Path, root: Path, options: SuiteOption
     torch.set_num_threads(options.threads)
     L.seed_everything(options.seed, verbose=False)
     robot = get_task(task).robot
-    train = model_params("ensemble" if name == "mlp" else name, task, options).train_model
-    if name == "mlp":
-        train = _plain(train, robot.observation_dim, robot.action_dim)
-    data, clock, budget = window_data(str(dataset), train, seed=options.seed), Clock(), train.ensemble or train
+    train = model_options("transformer" if name == "mlp" else name, options)
+    if isinstance(train, TransformerOptions) and name == "mlp":
+        train = _plain(train, options.ensemble, robot.observation_dim, robot.action_dim)
+    data = window_data(str(dataset), train, seed=options.seed)
+    clock = Clock()
     lit = lit_world_model(robot.observation_dim, robot.action_dim, train, options.seed, compile=options.compile)
     key = {"trial": time.time_ns(), "options": asdict(train)}  # never continued: its seconds would not be known
     with trained(
@@ -101,13 +102,13 @@ def _trial(name: str, task: str, dataset: Path, root: Path, options: SuiteOption
         data,
         run=run_folder(root, "bench_cost", key, []),
         target=None,
-        epochs=budget.updates // budget.updates_per_epoch,
+        epochs=train.updates // train.updates_per_epoch,
         precision=options.precision,
         progress=progress,
         gradient_clip=lit.gradient_clip,
         callbacks=[clock],
     ):
-        pass  # nothing is kept
+        pass
     trial = {
         "curve": clock.curve,
         "seconds_in_all": clock.curve[-1][0],
@@ -141,20 +142,21 @@ class Clock(Callback):
         self.paused = time.perf_counter()
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        teacher_forced = forecast(pl_module.best_model, self.stretches, feedback="recorded")  # pyright: ignore[reportArgumentType]
-        error = nmse(teacher_forced.mean, self.stretches, self.scale)[self.stretches.valid].mean()
+        forced = forecast(pl_module.best_model, self.stretches, feedback="recorded")  # pyright: ignore[reportArgumentType]
+        error = nmse(forced.mean, self.stretches, self.scale)[self.stretches.valid].mean()
         self.curve.append((round(self.paused - self.begin - self.pauses, 1), float(error)))
         self.pauses += time.perf_counter() - self.paused
 
 
-def _plain(train: TrainModelOptions, observation_dim: int, action_dim: int) -> TrainModelOptions:
+def _plain(
+    transformer: TransformerOptions, ensemble: EnsembleOptions, observation_dim: int, action_dim: int
+) -> EnsembleOptions:
     """One network as deep as the ensemble's, as wide as makes its parameters those of the transformer."""
-    assert train.ensemble is not None
     count = lambda module: sum(p.numel() for p in module.parameters())  # noqa: E731
-    wanted = count(EnvironmentTransformer(observation_dim, action_dim, **vars(train.model)))
-    layers, width = len(train.ensemble.hidden), 1
+    wanted = count(EnvironmentTransformer(observation_dim, action_dim, **vars(transformer.model)))
+    layers, width = len(ensemble.hidden), 1
     network = lambda: EnsembleDynamics(observation_dim, action_dim, members=1, elites=1, hidden=(width,) * layers)  # noqa: E731
     with torch.device("meta"):  # counts without filling memory
         while count(network()) < wanted:
             width += 1
-    return replace(train, ensemble=replace(train.ensemble, members=1, elites=1, hidden=(width,) * layers))
+    return replace(ensemble, members=1, elites=1, hidden=(width,) * layers)

@@ -1,14 +1,11 @@
-"""`envtf horizon`: how long world models track reality, for several robots, into one JSON, one table and figures."""
+"""The study `envtf horizon`: how long world models track reality, beside the ceiling that physics sets."""
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import fmean
-from typing import Any
+from typing import Any, ClassVar
 
 import pandas as pd
-import torch
 
 from envtf_lit.data.cards import markdown_table
 from envtf_lit.data.sources.files import load_dataset, save_dataset
@@ -17,38 +14,27 @@ from envtf_lit.evaluation.horizon import THRESHOLDS
 from envtf_lit.evaluation.physics import Physics, ceiling
 from envtf_lit.evaluation.tracking import Tracking, fresh_episodes, track, track_ceiling, track_sampled
 from envtf_lit.figures import horizons
-from envtf_lit.files import write_json, write_text
-from envtf_lit.results import claim
+from envtf_lit.files import write_text
 from envtf_lit.robots.returns import SEED_OFFSET
-from envtf_lit.robots.tasks import Task, get_task
-from envtf_lit.studies.suite import (
-    MODELS,
-    PHYSICS,
-    WORK,
-    Suite,
-    SuiteOptions,
-    build_suite,
-    flat_settings,
-    heading,
-    kept,
-    measurable,
-    other_folders,
-)
+from envtf_lit.robots.tasks import Task
+from envtf_lit.studies.study import Study
+from envtf_lit.studies.suite import PHYSICS, Suite, cached_result, flat_settings, load_for_study
 from envtf_lit.training import pick_device, run_folder
 from envtf_lit.world_models.forecast import Scale, Trajectories, whole_episodes
 
 ONLINE = ("random", "medium", "expert")  # policies of the zoo that drive MuJoCo
 SIZES = (1e-4, 1e-3, 1e-2, 1e-1)  # of disturbances, at which the ceiling is drawn
-FORMAT = 2  # of kept results; those of before lack explosions and are measured anew
+FORMAT = 2  # of cached results; those of before lack explosions and are measured anew
 RECORDED = "recorded"  # the tier's own episodes
-SUITE, EPISODES = "suite", "episodes"  # parts of the work, beside physics and the models
+FIGURES = ("open_loop", "teacher_forced", "online", "ceiling")
 
-Results = dict[str, dict[str, Tracking]]  # of a robot, by model and source of the episodes
+BySource = dict[str, Tracking]  # of a model, by source of the episodes; of physics, by size of the disturbance
+Found = Mapping[str, Mapping[str, BySource]]  # by robot and model
 
 
 @dataclass(frozen=True)
 class HorizonOptions:
-    """The trajectories that models are measured on.
+    """The numbers of episodes that models are measured on, and where in them a forecast begins.
 
     Attributes:
         trajectories: fresh episodes of the tier's behaviour policies, from their first step.
@@ -62,118 +48,72 @@ class HorizonOptions:
     start: int = 0
 
 
-def compare(
-    out: Path,
-    *,
-    robots: Sequence[str],
-    tier: str = "medium-replay",
-    work: Path = WORK,
-    options: SuiteOptions,
-    measured: HorizonOptions,
-    models: Sequence[str] = MODELS,
-    others: Mapping[str, str] | None = None,
-    progress: bool = True,
-    report: Callable[[str], None] = print,
-) -> dict[str, Any]:
-    """Measures every model on every robot; what an interrupted call has measured is kept below `work`.
+@dataclass(frozen=True)
+class HorizonStudy(Study[BySource]):
+    """Open-loop and teacher-forced lengths of each model, and how long disturbed physics lasts, under `physics`."""
 
-    Args:
-        out: JSON file to write after each robot; a table `.md` and a folder of figures of that name lie beside it.
-        robots: names.
-        tier: of the data that models are trained and measured on.
-        work: folder of suites; what was trained or measured there before with the same options is used again.
-        options: of the data and the models.
-        measured: how many episodes.
-        models: which of the suite's.
-        others: further models, name to folder; `{task}` and `{robot}` in a folder stand for those names.
-        progress: shows bars.
-        report: called with a line for each thing done.
+    options: HorizonOptions
+    mark: ClassVar[str] = "measured.trajectories"
 
-    Returns:
-        What the file holds, under flat keys: `flat_numbers` and what they depend on.
+    def check(self, task: Task) -> None:
+        if min(self.options.trajectories, self.options.online) < 1:
+            raise UserError("A length is a mean over at least one trajectory: ask for more than none.")
 
-    Raises:
-        UserError: an unknown robot or tier, too few episodes, a folder without a world model of the robot, a name that
-            is taken, or a file in the way that is none of this command's.
-    """
-    tasks = [get_task(f"{robot}-{tier}") for robot in dict.fromkeys(robots)]
-    further = other_folders(others or {}, tasks)
-    if min(measured.trajectories, measured.online) < 1:
-        raise UserError("A length is a mean over at least one trajectory: ask for more than none.")
-    claim(out, "measured.trajectories", [out.with_suffix(".md"), *_figures(out.with_suffix(""))])
-    torch.set_num_threads(options.threads)
-    clock = _Clock([SUITE, EPISODES, PHYSICS, *models, *(others or {})], len(tasks), report)
-    found: dict[str, Results] = {}
-    numbers = heading(tier, options, measured=measured)
-    for task in tasks:
-        robot = task.robot.name
-        built = build_suite(task.name, work, options, models=models, progress=progress)
-        clock.done(SUITE, f"{robot}: dataset and models")
-        course = _Course(task, built, work / task.name, measured, progress)
-        clock.done(EPISODES, f"{robot}: {course.episodes} fresh episodes")
-        found[robot] = {PHYSICS: course.measure_physics()}
-        clock.done(PHYSICS, f"{robot}: the ceiling set by physics")
-        for name, folder in (built.folders | further[task.name]).items():
-            found[robot][name] = course.measure(name, folder)
-            clock.done(name, f"{robot}: {name}: {_headline(found[robot][name][RECORDED].numbers)}")
-        numbers |= built.costs | flat_numbers({robot: found[robot]})
-        write_json(out, numbers)
+    def measure(
+        self, task: Task, suite: Suite, others: Mapping[str, Path], progress: bool
+    ) -> Iterator[tuple[str, BySource]]:
+        data = HorizonData(task, suite, self.options, progress)
+        yield PHYSICS, data.measure_physics()
+        for name, folder in (suite.folders | dict(others)).items():
+            yield name, data.measure(name, folder)
+
+    def headline(self, finding: BySource) -> str:
+        if RECORDED not in finding:
+            return f"steps that MuJoCo lasts from {len(finding)} disturbed starts"
+        numbers = finding[RECORDED].numbers
+        reached = ((t, numbers[f"open_loop_{t:g}"], numbers[f"ceiling_{t:g}"]) for t in THRESHOLDS)
+        return ", ".join(f"{steps:.1f} of {most:.1f} steps within {threshold:g}" for threshold, steps, most in reached)
+
+    def numbers(self, findings: Mapping[str, BySource]) -> dict[str, float]:
+        """`model.name` of the recorded episodes, `model.policy.name` online, `physics.SIZE.name`."""
+        return {
+            f"{model}.{name}" if source == RECORDED else f"{model}.{source}.{name}": value
+            for model, sources in findings.items()
+            for source, tracking in sources.items()
+            for name, value in tracking.numbers.items()
+        }
+
+    def beside(self, out: Path) -> list[Path]:
+        figures = [out.with_suffix("") / f"{name}{ending}" for name in FIGURES for ending in (".png", ".csv")]
+        return [out.with_suffix(".md"), *figures]
+
+    def show(self, found: Found, tier: str, out: Path) -> None:
         write_text(out.with_suffix(".md"), page(found, tier))
         draw(found, out.with_suffix(""))
-    return numbers
 
 
-def _headline(numbers: Mapping[str, float]) -> str:
-    reached = ((t, numbers[f"open_loop_{t:g}"], numbers[f"ceiling_{t:g}"]) for t in THRESHOLDS)
-    return ", ".join(f"{steps:.1f} of {most:.1f} steps within {threshold:g}" for threshold, steps, most in reached)
-
-
-class _Clock:
-    """Says what is done and about how long the rest takes, judged by the same part on other robots, or by any part.
-
-    Args:
-        parts: of the work on one robot.
-        rounds: robots.
-        report: is given the lines.
-    """
-
-    def __init__(self, parts: Sequence[str], rounds: int, report: Callable[[str], None]) -> None:
-        self.left = dict.fromkeys(parts, rounds)
-        self.report, self.begin = report, time.perf_counter()
-        self.seconds: dict[str, list[float]] = {}
-
-    def done(self, part: str, line: str) -> None:
-        """Notes that a part is done; one that lay there already tells nothing about the rest."""
-        elapsed, self.begin = time.perf_counter() - self.begin, time.perf_counter()
-        self.left[part] -= 1
-        if elapsed > 1.0:
-            self.seconds.setdefault(part, []).append(elapsed)
-        every = [value for values in self.seconds.values() for value in values] or [0.0]
-        left = sum(count * fmean(self.seconds.get(name, every)) for name, count in self.left.items())
-        self.report(f"{line} ({elapsed:.0f} s; about {left / 60:.0f} min left)")
-
-
-class _Course:
-    """One robot's episodes and physics, on which models are measured; results are kept in `home`.
+class HorizonData:
+    """One robot's fresh episodes and its simulator, on which models are measured; results are cached with the suite.
 
     Args:
         task: robot and tier.
         suite: gives the training data, whose spread is the unit of errors.
-        home: folder of the task.
         measured: how many episodes.
         progress: shows bars.
+
+    Raises:
+        UserError: no episode lasts longer than `measured.start`.
     """
 
-    def __init__(self, task: Task, suite: Suite, home: Path, measured: HorizonOptions, progress: bool) -> None:
-        self.home, self.suite = home, suite
-        self.seed, self.start = suite.options.seed, measured.start
+    def __init__(self, task: Task, suite: Suite, measured: HorizonOptions, progress: bool) -> None:
+        self.suite, self.seed, self.start = suite, suite.options.seed, measured.start
         self.device, self.robot = pick_device(), task.robot
         self.key = flat_settings(task.tier, suite.options, measured=measured)
         if measured.start > 0 and task.robot.clipped_from is not None:
             self.key["clipped_starts"] = "left out"  # they once counted, and results of then are others
         wanted = {RECORDED: (task, measured.trajectories)}
         wanted |= {name: (Task(task.robot, name), measured.online) for name in ONLINE}
-        folder = run_folder(home, "episodes", self.key | {"measured.start": 0}, [])  # the same from every start
+        folder = run_folder(suite.home, "episodes", self.key | {"measured.start": 0}, [])  # the same from every start
         fresh = {
             source: self._fresh(folder / f"{source}.h5", *ask, workers=suite.options.threads, progress=progress)
             for source, ask in wanted.items()
@@ -192,19 +132,15 @@ class _Course:
             save_dataset(fresh_episodes(task, count, seed=seed, workers=workers, progress=progress), file)
         return whole_episodes(load_dataset(file), count, seed=self.seed).later(self.start).to(self.device)
 
-    @property
-    def episodes(self) -> str:
-        return " + ".join(f"{len(found.lengths)} {source}" for source, found in self.trajectories.items())
-
-    def measure_physics(self) -> dict[str, Tracking]:
+    def measure_physics(self) -> BySource:
         """Ceilings by the size of the disturbance, as text."""
-        return self._kept(PHYSICS, [], lambda: {f"{size:g}": self._ceiling("ceiling", size) for size in SIZES})
+        return self._cached(PHYSICS, [], lambda: {f"{size:g}": self._ceiling("ceiling", size) for size in SIZES})
 
-    def measure(self, name: str, folder: Path) -> dict[str, Tracking]:
+    def measure(self, name: str, folder: Path) -> BySource:
         """A model's results by source of the episodes; the recorded ones with ceilings at its own one-step error."""
 
-        def work() -> dict[str, Tracking]:
-            model = measurable(folder, self.suite.options)
+        def work() -> BySource:
+            model = load_for_study(folder, self.suite.options)
             sources, rule = self.trajectories.items(), self.robot.terminated
             found = {source: track(model, episodes, self.scale, rule) for source, episodes in sources}
             drawn = track_sampled(model, self.trajectories[RECORDED], self.scale, seed=self.seed)
@@ -213,35 +149,24 @@ class _Course:
             typical = self._ceiling("ceiling_typical", errors["one_step_typical"])
             return found | {RECORDED: found[RECORDED] | drawn | most | typical}
 
-        return self._kept(name, [folder], work)
+        return self._cached(name, [folder], work)
 
     def _ceiling(self, name: str, size: float) -> Tracking:
         found = ceiling(self.physics, self.trajectories[RECORDED], self.scale, size, seed=self.seed)
         return track_ceiling(name, found, self.robot.terminated)
 
-    def _kept(self, name: str, inputs: list[Path], work: Callable[[], dict[str, Tracking]]) -> dict[str, Tracking]:
-        """Results of the work, now or when it was done on the same inputs."""
+    def _cached(self, name: str, inputs: list[Path], work: Callable[[], BySource]) -> BySource:
+        """The work's results, read if they lie there already."""
 
         def plain() -> dict[str, Any]:
             return {source: asdict(tracking) for source, tracking in work().items()}
 
-        found = kept(self.home, f"horizon-{name}", self.key, [self.suite.dataset, *inputs], plain)
+        found = cached_result(self.suite.home, f"horizon-{name}", self.key, [self.suite.dataset, *inputs], plain)
         return {source: Tracking(**content) for source, content in found.items()}
 
 
-def flat_numbers(found: Mapping[str, Results]) -> dict[str, float]:
-    """`robot.model.name` of the recorded episodes, `robot.model.policy.name` online, `robot.physics.SIZE.name`."""
-    numbers = {}
-    for robot, results in found.items():
-        for model, sources in results.items():
-            for source, tracking in sources.items():
-                prefix = f"{robot}.{model}" if source == RECORDED else f"{robot}.{model}.{source}"
-                numbers |= {f"{prefix}.{name}": value for name, value in tracking.numbers.items()}
-    return numbers
-
-
-def page(found: Mapping[str, Results], tier: str) -> str:
-    """The tables in Markdown."""
+def page(found: Found, tier: str) -> str:
+    """The Markdown page: a table of recorded actions, and one of policies that drive MuJoCo."""
     offline, online = [], []
     for robot, results in found.items():
         for model, sources in results.items():
@@ -296,25 +221,20 @@ def _online_cells(numbers: Mapping[str, float]) -> tuple[str, ...]:
     return (*(_steps(numbers, f"open_loop_{threshold:g}") for threshold in THRESHOLDS), *shares)
 
 
-def _figures(folder: Path) -> list[Path]:
-    """What `draw` writes."""
-    names = ("open_loop", "teacher_forced", "online", "ceiling")
-    return [folder / f"{name}{ending}" for name in names for ending in (".png", ".csv")]
-
-
-def draw(found: Mapping[str, Results], folder: Path) -> None:
+def draw(found: Found, folder: Path) -> None:
     """Every figure into a folder, each with its numbers as CSV beside it."""
     folder.mkdir(parents=True, exist_ok=True)
     curves = _curves(found)
     recorded, online = curves.query("source == @RECORDED"), curves.query("source != @RECORDED")
-    horizons.error_growth(recorded, "open_loop", folder / "open_loop.png")
-    horizons.error_growth(recorded, "teacher_forced", folder / "teacher_forced.png")
+    free, forced, driven, most = (folder / f"{name}.png" for name in FIGURES)
+    horizons.error_growth(recorded, "open_loop", free)
+    horizons.error_growth(recorded, "teacher_forced", forced)
     if len(online):
-        horizons.online_growth(online, folder / "online.png")
-    horizons.steps_against_ceiling(_lengths(found), folder / "ceiling.png")
+        horizons.online_growth(online, driven)
+    horizons.steps_against_ceiling(_lengths(found), most)
 
 
-def _curves(found: Mapping[str, Results]) -> pd.DataFrame:
+def _curves(found: Found) -> pd.DataFrame:
     return pd.concat(
         pd.DataFrame(columns).assign(robot=robot, model=model, source=source, run=run)
         for robot, results in found.items()
@@ -325,7 +245,7 @@ def _curves(found: Mapping[str, Results]) -> pd.DataFrame:
     )
 
 
-def _lengths(found: Mapping[str, Results]) -> pd.DataFrame:
+def _lengths(found: Found) -> pd.DataFrame:
     """Open-loop lengths of models, and ceilings, against the size of the error that is typical of a step."""
     rows = []
     for robot, results in found.items():

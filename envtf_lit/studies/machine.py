@@ -1,4 +1,4 @@
-"""What a measurement was made on, and how it is timed."""
+"""The machine of a measurement: its description, and timing on it."""
 
 import os
 import platform

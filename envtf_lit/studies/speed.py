@@ -1,4 +1,4 @@
-"""`envtf bench model`: how fast a world model imagines and learns, beside what it would replace.
+"""The benchmark `envtf bench model`: rates of imagination and training, beside what the world model would replace.
 
 Every ratio compares two sides that take turns in one process on one machine, in the same precision. Weights are random:
 they do not change the work. Predictive distributions have tails, as those of trained models do.
@@ -14,13 +14,13 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from envtf_lit.files import write_json
-from envtf_lit.imagination.histories import Starts
-from envtf_lit.imagination.options import GenerateRolloutsOptions
+from envtf_lit.imagination.histories import Histories
 from envtf_lit.imagination.rollouts import imagine
 from envtf_lit.options.schema import Precision
+from envtf_lit.pipeline.generate_rollouts import STRETCH
 from envtf_lit.pipeline.yaml import preset_params
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.results import claim
@@ -30,10 +30,9 @@ from envtf_lit.training import autocast
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.lit import LitWorldModel
-from envtf_lit.world_models.options import TrainModelOptions
+from envtf_lit.world_models.options import TransformerOptions
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
-SHARE = GenerateRolloutsOptions().share  # rollouts that begin in one window
 UNCACHED_CONTEXT = 32  # at which the cache is measured
 TAIL = 0.6  # of every output, a usual one
 CHUNK = 512  # windows that the model without its cache takes at a time
@@ -84,54 +83,69 @@ def bench_model(
     """
     if out is not None:
         claim(out, "train_fraction_of_matmul_peak")
-    place, options, body = bench_device(device), preset_params(preset).train_model, ROBOTS[robot]
-    options = replace(options, batch_size=windows or options.batch_size)
+    place, body = bench_device(device), ROBOTS[robot]
+    preset_options = preset_params(preset).train_model["transformer"]
+    assert isinstance(preset_options, TransformerOptions)
+    options = replace(preset_options, batch_size=windows or preset_options.batch_size)
     warm_up = 3 if compile else 1  # what is compiled is compiled again for other shapes, and recorded at its second run
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     with torch.no_grad(), autocast(place, precision), _simulators(body, threads) as simulators:
         actions = _imagination(body, options, place, batch, horizon, compile)
-        actions |= _cache(body, options, place, batch, compile)
-        actions |= {"real": lambda: _real(simulators, threads, real_steps)}
+        actions["real"] = lambda: _real(simulators, threads, real_steps)
         timings = in_turns(actions, rounds, warm_up=warm_up)
     del actions  # full caches, which training would have to share a GPU's memory with
-    train, flops = _training(body, options, place, precision, updates, compile)
-    learning = in_turns({"train": train, "matmul": _matmul(place, precision)}, rounds, warm_up=warm_up)
-    steps, tokens = batch * horizon, updates * options.batch_size * options.model.context
-    size, repeats = _matmul_size(place)
-    result: dict[str, Any] = {
-        "imagined_per_second": steps / typical(timings, "short"),
-        "imagined_per_second_full": steps / typical(timings, "full"),
-        "imagined_per_second_from_history": steps / typical(timings, "history"),
-        "imagined_per_second_from_shared_history": steps / typical(timings, "shared"),
-        "ensemble_per_second": steps / typical(timings, "ensemble"),
-        f"{robot}_steps_per_second": threads * real_steps / typical(timings, "real"),
-        "ratio_vs_ensemble_short": ratio(timings, "ensemble", "short"),
-        "ratio_vs_ensemble_full": ratio(timings, "ensemble_steps", "full"),
-        f"ratio_vs_{robot}": ratio(timings, "real", "short") * steps / (threads * real_steps),
-        "ratio_vs_uncached": ratio(timings, "uncached", "cached"),
-        "train_tokens_per_second": tokens / typical(learning, "train"),
-        "matmul_peak_gflops": 2e-9 * size**3 * repeats / typical(learning, "matmul"),
-        "train_fraction_of_matmul_peak": ratio(learning, "matmul", "train") * tokens * flops / (2 * size**3 * repeats),
-        "preset": preset,
-        "batch": batch,
-        "horizon": horizon,
-        "context": options.model.context,
-        "windows": options.batch_size,
-        "compile": compile,
-        "seed": seed,
-        **facts(place, precision),
-    }
+    result = _imagination_rates(robot, timings, batch * horizon, threads * real_steps)
+    result |= _learning_rates(body, options, place, precision, updates, compile, rounds, warm_up)
+    result |= dict(preset=preset, batch=batch, horizon=horizon, context=options.context)
+    result |= dict(windows=options.batch_size, compile=compile, seed=seed) | facts(place, precision)
     if out is not None:
         write_json(out, result)
     return result
 
 
+def _imagination_rates(robot: str, timings: list[dict[str, float]], steps: int, real_steps: int) -> dict[str, Any]:
+    """Steps per second, and ratios of rates, where a round imagines `steps` and simulates `real_steps`."""
+    return {
+        "imagined_per_second": steps / typical(timings, "short"),
+        "imagined_per_second_full": steps / typical(timings, "full"),
+        "imagined_per_second_from_history": steps / typical(timings, "history"),
+        "imagined_per_second_from_shared_history": steps / typical(timings, "shared"),
+        "ensemble_per_second": steps / typical(timings, "ensemble"),
+        f"{robot}_steps_per_second": real_steps / typical(timings, "real"),
+        "ratio_vs_ensemble_short": ratio(timings, "ensemble", "short"),
+        "ratio_vs_ensemble_full": ratio(timings, "ensemble_steps", "full"),
+        f"ratio_vs_{robot}": ratio(timings, "real", "short") * steps / real_steps,
+        "ratio_vs_uncached": ratio(timings, "uncached", "cached"),
+    }
+
+
+def _learning_rates(
+    robot: Robot,
+    options: TransformerOptions,
+    device: torch.device,
+    precision: Precision,
+    updates: int,
+    compile: bool,
+    rounds: int,
+    warm_up: int,
+) -> dict[str, float]:
+    """Tokens per second of training, and the share of a matrix product's rate that they reach."""
+    train, flops = _training(robot, options, device, precision, updates, compile)
+    timings = in_turns({"train": train, "matmul": _matmul(device, precision)}, rounds, warm_up=warm_up)
+    (size, repeats), tokens = _matmul_size(device), updates * options.batch_size * options.context
+    return {
+        "train_tokens_per_second": tokens / typical(timings, "train"),
+        "matmul_peak_gflops": 2e-9 * size**3 * repeats / typical(timings, "matmul"),
+        "train_fraction_of_matmul_peak": ratio(timings, "matmul", "train") * tokens * flops / (2 * size**3 * repeats),
+    }
+
+
 def _imagination(
-    robot: Robot, options: TrainModelOptions, device: torch.device, batch: int, horizon: int, compile: bool
+    robot: Robot, options: TransformerOptions, device: torch.device, batch: int, horizon: int, compile: bool
 ) -> dict[str, Callable[[], float]]:
-    """Rollouts from single states by both models, and, with the transformer's cache full, their steps alone."""
-    S, A, context = robot.observation_dim, robot.action_dim, options.model.context
+    """Rollouts from single states by both models; their steps alone, the transformer's cache full; and `_cache`."""
+    S, A, context = robot.observation_dim, robot.action_dim, options.context
     transformer = _frozen(EnvironmentTransformer(S, A, **vars(options.model)), device, compile)
     ensemble = _frozen(EnsembleDynamics(S, A), device, compile)
     actor = TanhGaussianActor(S, A).to(device)
@@ -139,8 +153,8 @@ def _imagination(
 
     shared = _shared_histories(robot, batch, context, device)
 
-    def rollouts(model: WorldModel, starts: tuple[Tensor, Tensor, Tensor] | Starts) -> Callable[[], float]:
-        run = lambda: imagine(model, actor, starts, horizon=horizon, terminated=never_terminated, batch_size=batch)  # noqa: E731
+    def rollouts(model: WorldModel, histories: Histories) -> Callable[[], float]:
+        run = lambda: imagine(model, actor, histories, horizon=horizon, terminated=never_terminated, batch_size=batch)  # noqa: E731
         return lambda: seconds(run, device)
 
     return {
@@ -148,8 +162,9 @@ def _imagination(
         "ensemble": rollouts(ensemble, single),
         "history": rollouts(transformer, past),
         "shared": rollouts(transformer, shared),
-        "full": _steps(transformer, transformer.init(*past), actor, horizon, device),
-        "ensemble_steps": _steps(ensemble, ensemble.init(*single), actor, horizon, device),
+        "full": _steps(transformer, past.begin(transformer), actor, horizon, device),
+        "ensemble_steps": _steps(ensemble, single.begin(ensemble), actor, horizon, device),
+        **_cache(robot, options, device, batch, compile),
     }
 
 
@@ -167,14 +182,15 @@ def _steps(
 
 
 def _cache(
-    robot: Robot, options: TrainModelOptions, device: torch.device, batch: int, compile: bool
+    robot: Robot, options: TransformerOptions, device: torch.device, batch: int, compile: bool
 ) -> dict[str, Callable[[], float]]:
     """One step of all rollouts where the window is full: with the cache, and by a pass over the whole window."""
     wide = vars(options.model) | {"context": UNCACHED_CONTEXT}
     model = _frozen(EnvironmentTransformer(robot.observation_dim, robot.action_dim, **wide), device, compile)
     encode = torch.compile(model.encode) if compile else model.encode
-    observations, actions, lengths = _histories(robot, batch, UNCACHED_CONTEXT, device)
-    state, action = model.init(observations, actions, lengths), torch.randn(batch, robot.action_dim, device=device)
+    seen = _histories(robot, batch, UNCACHED_CONTEXT, device)
+    observations, actions = seen.observations, seen.actions
+    state, action = seen.begin(model), torch.randn(batch, robot.action_dim, device=device)
     windows = observations.split(CHUNK), torch.cat([actions, action[:, None]], 1).split(CHUNK)
 
     def cached() -> None:
@@ -190,19 +206,19 @@ def _cache(
     return {"cached": lambda: seconds(cached, device), "uncached": lambda: seconds(uncached, device)}
 
 
-def _histories(robot: Robot, batch: int, length: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """What `WorldModel.init` takes, at random."""
+def _histories(robot: Robot, batch: int, length: int, device: torch.device) -> Histories:
+    """Histories of random numbers."""
     observations = torch.randn(batch, length, robot.observation_dim, device=device)
     actions = torch.randn(batch, length - 1, robot.action_dim, device=device)
-    return observations, actions, torch.full((batch,), length, device=device)
+    return Histories(observations, actions, torch.full((batch,), length, device=device))
 
 
-def _shared_histories(robot: Robot, batch: int, length: int, device: torch.device) -> Starts:
-    """The same where `SHARE` rollouts begin in each window, one step apart."""
-    windows = -(-batch // SHARE)
-    observations, actions, _ = _histories(robot, windows, length + SHARE - 1, device)
+def _shared_histories(robot: Robot, batch: int, length: int, device: torch.device) -> Histories:
+    """The same where `STRETCH` rollouts begin in each window, one step apart."""
+    windows = -(-batch // STRETCH)
+    seen = _histories(robot, windows, length + STRETCH - 1, device)
     branch = torch.arange(batch, device=device)
-    return observations, actions, length + branch % SHARE, branch // SHARE
+    return Histories(seen.observations, seen.actions, length + branch % STRETCH, branch // STRETCH)
 
 
 def _frozen(model: Any, device: torch.device, compile: bool) -> Any:
@@ -215,7 +231,7 @@ def _frozen(model: Any, device: torch.device, compile: bool) -> Any:
 
 def _training(
     robot: Robot,
-    options: TrainModelOptions,
+    options: TransformerOptions,
     device: torch.device,
     precision: Precision,
     updates: int,
@@ -227,7 +243,7 @@ def _training(
     """
     module = LitWorldModel(robot.observation_dim, robot.action_dim, options, compile=compile).to(device)
     optimizer = module.configure_optimizers()["optimizer"]
-    shape = options.batch_size, options.model.context
+    shape = options.batch_size, options.context
     batch = {
         "observations": torch.randn(*shape, robot.observation_dim, device=device),
         "actions": torch.randn(*shape, robot.action_dim, device=device),

@@ -1,7 +1,7 @@
-"""The world models that are compared throughout, trained alike on one of the zoo's datasets.
+"""A suite: the three world models that studies compare, trained on one of the zoo's datasets, and kept on disk.
 
-The transformer, the same transformer with a context of one step, and the ensemble: what is measured of world models is
-measured of these three, and models that lie there already, trained with the same settings, are not trained again.
+The transformer, the same transformer with a context of one step, and the ensemble. A model that lies there already,
+trained with the same settings, is not trained again.
 """
 
 import json
@@ -22,16 +22,17 @@ from envtf_lit.data.sources.fetch import sha256
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import read_json, write_json
-from envtf_lit.options.schema import Precision
+from envtf_lit.options.schema import Precision, rebuild
 from envtf_lit.pipeline.download import download
-from envtf_lit.pipeline.params import Params, check_ranges
+from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.stage import CARD, DATASET, run_settings
 from envtf_lit.results import has, read_or_none, refuse_others
 from envtf_lit.robots.tasks import Robot, Task, get_task
 from envtf_lit.studies.machine import hardware
 from envtf_lit.training import pick_device, run_folder
 from envtf_lit.world_models.fit import fit_world_model
-from envtf_lit.world_models.options import EnsembleOptions, ModelOptions, TrainModelOptions, check_world_model
+from envtf_lit.world_models.interface import WorldModel
+from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions, WorldModelOptions
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.uncertainty.recalibration import calibration_split
 from envtf_lit.zoo.snapshots import describe_origin
@@ -40,13 +41,13 @@ MODELS = ("transformer", "context_1", "ensemble")  # their names in every table,
 PHYSICS = "physics"  # what stands beside them under that name, so that no other model may have it
 WORDS = ("trained_with", "note")  # of a dataset's origin: about the whole series, of which a tier may use a part
 SHARED = ("seed", "threads", "precision", "compile")  # options that a suite has in common with `Params`
-FORMAT = 3  # of saved transformers; those of before cannot be read and are trained anew
+FORMAT = 4  # of saved transformers; those of before cannot be read and are trained anew
 WORK = Path(".envtf/suite")  # where suites are kept unless told otherwise
 
 
 @dataclass(frozen=True)
 class SuiteOptions:
-    """What the models of a suite share, and their budgets.
+    """The dataset of a suite, the sizes of its models, and their budgets.
 
     Attributes:
         transitions: rows of the zoo's dataset.
@@ -62,8 +63,8 @@ class SuiteOptions:
 
     transitions: int = 100_000
     updates: int = 6_000
-    windows: int = TrainModelOptions().batch_size
-    context: int = ModelOptions().context
+    windows: int = TransformerOptions().batch_size
+    context: int = TransformerOptions().context
     ensemble: EnsembleOptions = field(default_factory=EnsembleOptions)
     seed: int = 0
     threads: int = 2
@@ -73,7 +74,7 @@ class SuiteOptions:
 
 @dataclass(frozen=True)
 class Suite:
-    """Trained models on disk; `load_world_model(suite.folders[name])` gives one.
+    """A dataset and the world models trained on it, on disk; `load_world_model(suite.folders[name])` gives one.
 
     Attributes:
         task: robot and tier.
@@ -94,19 +95,24 @@ class Suite:
     updates: dict[str, int]
 
     @property
+    def home(self) -> Path:
+        """The folder of all that belongs to the task: data, models, results of studies."""
+        return self.dataset.parents[1]
+
+    @property
     def costs(self) -> dict[str, float]:
         """`robot.model.train_seconds` and `robot.model.updates` of every model."""
         kinds = {"train_seconds": self.seconds, "updates": self.updates}
         return {f"{self.robot.name}.{name}.{kind}": value for kind, by in kinds.items() for name, value in by.items()}
 
     def split(self) -> tuple[OfflineDataset, OfflineDataset | None, OfflineDataset]:
-        """The episodes that every model was trained on, calibrated on (if there are any), and neither."""
-        training, held_out = load_dataset(self.dataset).split(TrainModelOptions().held_out, seed=self.options.seed)
+        """The episodes for training, for calibration (None if there are too few), and for testing, of every model."""
+        training, held_out = load_dataset(self.dataset).split()
         return training, *calibration_split(held_out)
 
 
 def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
-    """What a comparison's numbers depend on beside the models, under flat keys: `tier`, `suite.…`, `versions.…`.
+    """The settings of a study, under flat keys: `tier`, `suite.…`, `versions.…`, and the study's own options.
 
     Args:
         tier: of the data.
@@ -122,25 +128,28 @@ def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str
     }
 
 
-def heading(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
-    """What stands at the head of a comparison's file: `flat_settings`, `suite.ensemble.…` and `machine.…`.
+def result_header(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:
+    """The first keys of a study's JSON file: `flat_settings`, `suite.ensemble.…` and `machine.…`.
 
-    `kept` asks for neither of the latter: the models' bytes tell how they were trained, and the machine hardly counts.
+    `cached_result` asks for neither of the latter: the models' bytes tell how they were trained, and the machine hardly
+    counts.
     """
     ensemble = {f"suite.ensemble.{name}": value for name, value in _plain(asdict(options.ensemble)).items()}
     machine = {f"machine.{name}": value for name, value in hardware(pick_device()).items()}
     return flat_settings(tier, options, **measured) | ensemble | machine
 
 
-def kept(home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path], measure: Callable[[], Any]) -> Any:
-    """What a measurement gives, as JSON has it: now, or when it was made with these settings on the same inputs.
+def cached_result(
+    home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path], measure: Callable[[], Any]
+) -> Any:
+    """The result of a measurement, as JSON has it: read if it was made with these settings on the same inputs.
 
     Args:
-        home: folder below which it is kept.
+        home: folder below which results are kept.
         name: of the measurement.
         settings: as `flat_settings` has them.
         inputs: files and folders whose bytes count.
-        measure: makes it.
+        measure: called where there is no such result yet.
     """
     place = run_folder(home, name, settings, inputs).with_suffix(".json")
     if not place.exists():
@@ -148,13 +157,13 @@ def kept(home: Path, name: str, settings: dict[str, Any], inputs: Sequence[Path]
     return read_json(place)
 
 
-def measurable(folder: Path, options: SuiteOptions) -> Any:
-    """A world model as it is measured: on the accelerator if there is one, through torch.compile if the suite is."""
+def load_for_study(folder: Path, options: SuiteOptions) -> WorldModel:
+    """The world model in a folder, on the accelerator if there is one, through torch.compile if the suite is."""
     return load_world_model(folder, fused=options.compile).to(pick_device())
 
 
 def other_folders(others: Mapping[str, str], tasks: Sequence[Task]) -> dict[str, dict[str, Path]]:
-    """Folders of models that are none of the suite's, by task and name; each is read, so that none fails hours later.
+    """Folders of models beside the suite's, by task and name; each is read once, so that none fails hours later.
 
     Args:
         others: name to folder; `{task}` and `{robot}` in a folder stand for those names.
@@ -196,7 +205,7 @@ def build_suite(
     for name in models:
         if name not in MODELS:
             raise UserError(f"Unknown model {name!r}: {did_you_mean(name, MODELS)}")
-    home, params = root / task, {name: model_params(name, task, options) for name in models}
+    home, trained = root / task, {name: model_options(name, options) for name in models}
     key = {"task": task, "transitions": options.transitions, "seed": options.seed}
     origin = _plain(describe_origin(get_task(task), options.transitions, options.seed))
     key |= {"origin": {name: value for name, value in origin.items() if name not in WORDS}}
@@ -204,14 +213,14 @@ def build_suite(
     # a record that is older than this key is judged by the dataset's card
     older = {"origin": {name: read_json(card).get(name) for name in key["origin"]}} if card.exists() else {}
     suite = Suite(task, get_task(task).robot, options, home / DATASET, {}, {}, {})
-    collect = partial(download, shared, home, progress=progress)
-    _unless_done(home / "data.json", suite.dataset, key, collect, older)
+    work = partial(download, shared, home, progress=progress)
+    _unless_done(home / "data.json", suite.dataset, key, work, older)
     for name in models:
-        add_model(suite, name, params[name].train_model, progress=progress)
+        add_model(suite, name, trained[name], progress=progress)
     return suite
 
 
-def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: bool = True) -> None:
+def add_model(suite: Suite, name: str, options: WorldModelOptions, *, progress: bool = True) -> None:
     """Trains a model on a suite's dataset and enters it there; one that lies there, trained alike, is kept.
 
     Args:
@@ -220,25 +229,22 @@ def add_model(suite: Suite, name: str, options: TrainModelOptions, *, progress: 
         options: of the model and its training.
         progress: shows a bar.
 
-    Raises:
-        UserError: options that contradict each other.
     """
-    check_world_model(options)
-    home, shared = suite.dataset.parents[1], suite.options
-    params = replace(Params(), task=suite.task, train_model=options, **_common(shared))
+    home, shared = suite.home, suite.options
+    params = replace(Params(), task=suite.task, **_common(shared))
     key = {"task": suite.task, "transitions": shared.transitions, **{name: getattr(shared, name) for name in SHARED}}
     key |= {"train_model": _plain(asdict(options)), "dataset": sha256(suite.dataset)}
-    key |= {"format": FORMAT} if options.ensemble is None else {}
+    key |= {"format": FORMAT} if isinstance(options, TransformerOptions) else {}
     suite.folders[name] = home / "models" / name
-    train = partial(_train, params, suite.dataset, suite.folders[name], home, progress)
+    train = partial(_train, params, options, suite.dataset, suite.folders[name], home, progress)
     record = home / "models" / f"{name}.json"
     # an option that is younger than the record had its default when that was written
-    older: dict[str, Any] = {"train_model": _plain(asdict(TrainModelOptions())), "compile": False}
+    older: dict[str, Any] = {"train_model": _plain(asdict(type(options)())), "compile": False}
     if record.exists() and record.stat().st_mtime >= suite.dataset.stat().st_mtime:  # trained on what lies there
         older["dataset"] = key["dataset"]
     suite.seconds[name] = _unless_done(record, suite.folders[name], key, train, older)
     epochs = len((suite.folders[name] / "curves.csv").read_text().splitlines()) - 1  # the first line names columns
-    suite.updates[name] = epochs * (options.ensemble or options).updates_per_epoch
+    suite.updates[name] = epochs * options.updates_per_epoch
 
 
 def _plain(options: dict[str, Any]) -> dict[str, Any]:
@@ -247,30 +253,28 @@ def _plain(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _common(options: SuiteOptions) -> dict[str, Any]:
-    """What the stages' parameters take over from the suite's."""
+    """The pipeline's parameters that a suite sets: `SHARED`, and the size of the dataset."""
     download = DownloadOptions(transitions=options.transitions)
     return {name: getattr(options, name) for name in SHARED} | {"download": download}
 
 
-def model_params(name: str, task: str, options: SuiteOptions) -> Params:
-    """The parameters that train one of `MODELS`.
+def model_options(name: str, options: SuiteOptions) -> WorldModelOptions:
+    """The options that train one of `MODELS`.
 
     Raises:
         UserError: options that are out of range or contradict each other.
     """
-    train = TrainModelOptions(
-        updates=options.updates, updates_per_epoch=min(1_000, options.updates), batch_size=options.windows
+    if name == "ensemble":  # one for every budget of the transformer's
+        return rebuild(options.ensemble)
+    train = TransformerOptions(
+        updates=options.updates,
+        updates_per_epoch=max(1, min(1_000, options.updates)),
+        batch_size=options.windows,
+        context=options.context,
     )
-    train = replace(train, model=replace(train.model, context=options.context))
     if name == "context_1":  # windows of one step, as many steps per update
-        model = replace(train.model, context=1)
-        train = replace(train, model=model, batch_size=train.batch_size * options.context)
-    elif name == "ensemble":
-        train = TrainModelOptions(ensemble=options.ensemble)  # one for every budget of the transformer's
-    params = replace(Params(), task=task, train_model=train, **_common(options))
-    check_ranges(params)
-    check_world_model(train)
-    return params
+        train = replace(train, context=1, batch_size=train.batch_size * options.context)
+    return rebuild(train)
 
 
 def _unless_done(
@@ -297,17 +301,17 @@ def _over(defaults: Any, given: Any) -> Any:
     return defaults | {name: _over(defaults.get(name), value) for name, value in given.items()}
 
 
-def _train(params: Params, dataset: Path, folder: Path, home: Path, progress: bool) -> None:
+def _train(params: Params, options: WorldModelOptions, dataset: Path, folder: Path, home: Path, progress: bool) -> None:
     torch.set_num_threads(params.threads)
     L.seed_everything(params.seed, verbose=False)
     fit_world_model(
-        params.train_model,
+        options,
         dataset,
         folder,
         seed=params.seed,
         precision=params.precision,
         compile=params.compile,
-        settings=run_settings(params, asdict(params.train_model)),
+        settings=run_settings(params, options),
         root=home,
         progress=progress,
     )

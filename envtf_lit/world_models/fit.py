@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from envtf_lit.data.loaders import WindowData
+from envtf_lit.data.datamodules import WindowData
 from envtf_lit.files import replacing
 from envtf_lit.options.schema import Precision
 from envtf_lit.training import Curves, record_training, run_folder, trained
@@ -19,7 +19,6 @@ def fit_world_model(
     dataset: Path,
     target: Path,
     *,
-    held_out: float,
     seed: int,
     precision: Precision,
     compile: bool,
@@ -33,7 +32,6 @@ def fit_world_model(
         options: of the model and its training.
         dataset: HDF5 or NPZ.
         target: folder of the weights, metrics, curves and resolved options.
-        held_out: share of the episodes kept for validation.
         seed: of everything random; global seeds and threads are the caller's.
         precision: of matrix products in training.
         compile: trains through torch.compile.
@@ -46,7 +44,7 @@ def fit_world_model(
         Parameters, epoch of the kept weights, and their held-out errors; those of the termination head, too, where
         the data are of a robot whose rule is unknown, and some episode terminates.
     """
-    data = window_data(str(dataset), options, held_out=held_out, seed=seed)
+    data = window_data(str(dataset), options, seed=seed)
     lit = lit_world_model(data.observation_dim, data.action_dim, options, seed=seed, compile=compile)
     with trained(
         lit,

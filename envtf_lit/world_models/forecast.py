@@ -7,11 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
 from envtf_lit.world_models.interface import Mode, Prediction, WorldModel
-from envtf_lit.world_models.normaliser import CONSTANT
 from envtf_lit.world_models.unroll import unroll
 
 
@@ -21,7 +19,7 @@ class Scale:
 
     Attributes:
         mean, std: (S + 1,) of the observations and, last, the reward.
-        live: (S + 1,) bool, dimensions whose std is at least 1e-6.
+        live: (S + 1,) bool, dimensions that are not constant (`Moments.live`).
     """
 
     mean: Tensor
@@ -31,12 +29,8 @@ class Scale:
     @classmethod
     def of(cls, training: OfflineDataset, device: torch.device | str = "cpu") -> "Scale":
         """Statistics of the training data, accumulated in float64."""
-        mean, std = moments(
-            torch.as_tensor(np.column_stack([training.observations[rows], training.rewards[rows]]))
-            for rows in column_blocks(training.observations)
-        )
-        std = std.float().to(device)
-        return cls(mean.float().to(device), std, std >= CONSTANT)
+        found = training.statistics.observations + training.statistics.rewards
+        return cls(found.mean.float().to(device), found.std.float().to(device), found.live.to(device))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from envtf_lit import training
-from envtf_lit.data.loaders import WindowData, epoch_generator
+from envtf_lit.data.datamodules import WindowData
+from envtf_lit.data.loaders import epoch_generator
 from envtf_lit.errors import UserError
 from envtf_lit.options.schema import build
 from envtf_lit.world_models.ensemble import EnsembleDynamics
@@ -42,9 +43,9 @@ def lit_world_model(
     return kind(observation_dim, action_dim, options, seed, init_from, freeze, compile)
 
 
-def window_data(path: str, options: WorldModelOptions, *, held_out: float, seed: int) -> WindowData:
+def window_data(path: str, options: WorldModelOptions, *, seed: int) -> WindowData:
     """The data module of windows that such options are trained on."""
-    return WindowData(path, **window_options(options), held_out=held_out, seed=seed)
+    return WindowData(path, **window_options(options), seed=seed)
 
 
 def window_options(options: WorldModelOptions) -> dict[str, Any]:

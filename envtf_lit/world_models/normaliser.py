@@ -1,12 +1,10 @@
-"""The scales between the data's units and the network's: buffers of the model, so that they are saved with it."""
+"""The z-scoring of a world model's inputs and targets: buffers of the model, saved with it."""
 
 import torch
 from torch import Tensor, nn
 
-from envtf_lit.data.columns import column_blocks, moments
 from envtf_lit.data.dataset import OfflineDataset
 
-CONSTANT = 1e-6  # a dimension whose standard deviation is below this is constant: not live
 MARGIN = 0.1  # of a range, by which bounded outcomes may leave it
 
 
@@ -14,7 +12,7 @@ class Normaliser(nn.Module):
     """Z-scores of observations, actions and targets.
 
     Targets are (S + 1): the state's change (`delta`) or the next state (`absolute`), then the reward, each over its own
-    standard deviation. Constant dimensions keep scale 1 and are marked as not live.
+    standard deviation. Constant dimensions have the scale of `Moments.scale`; constant observations are not live.
 
     Args:
         observation_dim: S.
@@ -46,30 +44,14 @@ class Normaliser(nn.Module):
 
     def fit(self, dataset: OfflineDataset) -> None:
         """Takes means and standard deviations, and the bounds if it has any, from the training rows."""
-
-        def outcomes(rows: slice) -> Tensor:
-            following, rewards = dataset.next_observations[rows], dataset.rewards[rows]
-            return torch.cat([torch.as_tensor(following), torch.as_tensor(rewards)[:, None]], dim=-1)
-
-        def targets(rows: slice) -> Tensor:
-            outcome = outcomes(rows)
-            if self.delta:
-                outcome[:, :-1] -= torch.as_tensor(dataset.observations[rows])
-            return outcome
-
-        for name, values in (
-            ("observation", lambda rows: torch.as_tensor(dataset.observations[rows])),
-            ("action", lambda rows: torch.as_tensor(dataset.actions[rows])),
-            ("target", targets),
-        ):
-            mean, std = moments(map(values, column_blocks(dataset.observations)))
-            getattr(self, f"{name}_mean").copy_(mean)
-            getattr(self, f"{name}_std").copy_(torch.where(std < CONSTANT, 1.0, std))
-            if name == "observation":
-                self.live.copy_(std >= CONSTANT)
+        data = dataset.statistics
+        targets = data.changes if self.delta else data.outcomes
+        for name, found in (("observation", data.observations), ("action", data.actions), ("target", targets)):
+            getattr(self, f"{name}_mean").copy_(found.mean)
+            getattr(self, f"{name}_std").copy_(found.scale)
+        self.live.copy_(data.observations.live)
         if self.bounded:
-            extremes = [torch.stack(outcomes(rows).aminmax(dim=0)) for rows in column_blocks(dataset.observations)]
-            low, high = torch.stack([e[0] for e in extremes]).amin(0), torch.stack([e[1] for e in extremes]).amax(0)
+            low, high = data.outcomes.low.float(), data.outcomes.high.float()
             self.outcome_low.copy_(low - MARGIN * (high - low))
             self.outcome_high.copy_(high + MARGIN * (high - low))
 

@@ -12,12 +12,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from envtf_lit.data.columns import column_blocks, moments
+from envtf_lit.data.columns import column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import epoch_generator
 from envtf_lit.modules import load_module, save_module
 from envtf_lit.robots.tasks import get_task, never_terminated
-from envtf_lit.world_models.normaliser import CONSTANT
 
 HIDDEN, UPDATES, BATCH, LEARNING_RATE = 64, 2_000, 256, 0.003
 
@@ -26,7 +25,7 @@ class TerminationHead(nn.Module):
     """Binary classifier of next observations: terminated or not.
 
     Attributes:
-        mean, std: (S,) of the training data's next observations; constant dimensions have std 1.
+        mean, std: (S,) of the training data's next observations; see `Moments.scale` for constant dimensions.
         threshold: log-odds above which a row counts as terminated: over the training rows, as often as they were.
     """
 
@@ -61,9 +60,9 @@ class TerminationHead(nn.Module):
         """
         generator = epoch_generator(seed, 0, "termination")
         columns = training.next_observations
-        mean, std = moments(torch.as_tensor(columns[rows]) for rows in column_blocks(columns))
-        self.mean.copy_(mean)
-        self.std.copy_(torch.where(std < CONSTANT, 1.0, std))
+        found = training.statistics.next_observations
+        self.mean.copy_(found.mean)
+        self.std.copy_(found.scale)
         ended, going = np.flatnonzero(training.terminated), np.flatnonzero(~training.terminated)
         label = (torch.arange(BATCH) < BATCH // 2).float()
         optimizer = torch.optim.AdamW(self.layers.parameters(), lr=LEARNING_RATE)

@@ -1,4 +1,4 @@
-"""The zoo's datasets in one folder: each with its card, all in one table and one figure."""
+"""A folder of the zoo's datasets: each with its card, all in one table and one figure."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence

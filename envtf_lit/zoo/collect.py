@@ -1,4 +1,4 @@
-"""Datasets from behaviour policies in MuJoCo, the same rows with any number of processes."""
+"""Collection of datasets by behaviour policies in MuJoCo, the same rows with any number of processes."""
 
 import multiprocessing
 from collections.abc import Iterator

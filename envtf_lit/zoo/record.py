@@ -1,4 +1,4 @@
-"""A policy acts in several simulators at once, and what it lives through is recorded as whole episodes."""
+"""Whole episodes of a policy in several simulators at once, as columns of transitions."""
 
 from dataclasses import dataclass, field
 
@@ -65,7 +65,7 @@ class _Trace:
 
 @dataclass
 class _Log:
-    """What E environments live through, step after step, in arrays (T, E, ...) that grow; episodes point into it.
+    """Steps of E environments in arrays (T, E, ...) that grow, and the episodes in them.
 
     Attributes:
         robot: gives the columns their widths.

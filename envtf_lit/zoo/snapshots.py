@@ -1,4 +1,4 @@
-"""Behaviour policies that come along, and how a tier's dataset is made up of them."""
+"""The shipped behaviour policies (snapshots along training), and which of them collect a tier's dataset."""
 
 import math
 import platform
@@ -69,7 +69,7 @@ class Series:
         return min(self.up_to(self.expert), key=lambda snapshot: abs(snapshot.mean_return - third))
 
     def up_to(self, last: Snapshot) -> list[Snapshot]:
-        """The snapshots of the learner's life until it became `last`, which is included."""
+        """The snapshots up to `last`, which is included."""
         return [snapshot for snapshot in self.snapshots if snapshot.steps <= last.steps]
 
 
@@ -122,7 +122,7 @@ class Phase:
 
 
 def plan(task: Task, transitions: int, series: Series | None = None) -> list[Phase]:
-    """Who collects how much of a task's dataset, in this order.
+    """The policies that collect a task's dataset and the rows of each, in this order.
 
     - `random`: uniform actions.
     - `medium`: the snapshot whose return is nearest to a third of the expert's.

@@ -1,4 +1,4 @@
-"""Trains behaviour policies for the zoo with sbx (the extra `behaviour`), and keeps their weights along the way."""
+"""Training of the zoo's behaviour policies with sbx (the extra `behaviour`): snapshots of the weights along the way."""
 
 import math
 import os
@@ -182,8 +182,8 @@ def _keep(actor: TanhGaussianActor, robot: Robot, steps: int, folder: Path) -> S
     )
 
 
-def settle(robot: Robot, zoo: Path, *, last: int = 3, noise: float = 0.5) -> Snapshot:
-    """Exchanges a series' last snapshot for a calmer one: the late snapshots' mean weights, with less noise.
+def average_last_snapshots(robot: Robot, zoo: Path, *, last: int = 3, noise: float = 0.5) -> Snapshot:
+    """Replaces a series' last snapshot by the mean of the last ones' weights, with a smaller standard deviation.
 
     A constant learning rate leaves a learner circling its optimum; the mean of late weights lies nearer to it
     (stochastic weight averaging, Izmailov et al. 2018). Maximum-entropy learners end with more noise than their return

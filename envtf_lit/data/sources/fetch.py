@@ -1,4 +1,4 @@
-"""Downloads that survive a bad network: resumed, retried, checked against a known sum, whole or absent."""
+"""HTTP downloads: resumed, retried, checked against a known sum, whole or absent."""
 
 import errno
 import hashlib

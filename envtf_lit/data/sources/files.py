@@ -1,4 +1,4 @@
-"""D4RL-style HDF5 and NPZ files, in both directions. docs/datasets.md names the columns.
+"""Reading and writing of D4RL-style HDF5 and NPZ files; docs/datasets.md names the columns.
 
 Nothing in a file can run code or lead elsewhere: no objects, no pickle, no links, no storage outside the file, no
 filters but HDF5's own, no sizes that the file itself cannot hold.
@@ -17,9 +17,11 @@ from typing import Any
 import h5py
 import numpy as np
 
-from envtf_lit.data.checks import Finding, build_dataset
+from envtf_lit.data.action_space import PLACES, gather_limits
+from envtf_lit.data.checks import build_dataset
 from envtf_lit.data.columns import Column, FileRows, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.findings import Finding
 from envtf_lit.errors import UserError
 from envtf_lit.files import replacing
 
@@ -34,11 +36,14 @@ ALIASES = {
     "episode_index": ("episode_index", "episode", "episode_id", "episode_ids"),
 }
 ATTRIBUTES = ("task", "action_low", "action_high")
+ALL_PLACES = tuple(place for places in PLACES.values() for place in places)
+HELD_OUT = "held_out"  # (E,), for each episode whether it is held out
 HDF5_ENDINGS, NPZ_ENDINGS = (".h5", ".hdf5"), (".npz",)
 HDF5_FILTERS = {1, 2, 3, 4, 5, 6, 32000}  # gzip, shuffle, fletcher32, szip, nbit, scaleoffset, lzf: no plugins
 # no log of numbers shrinks to a 200th: a file that declares more than this, and more than that, is damaged or a trap
 BOMB_RATIO, BOMB_BYTES = 200, 256 << 20
 LARGEST_ATTRIBUTE = 1 << 20  # bytes
+ODD = "neither a short text nor a few numbers"
 # of a file with more than this, columns of more than a quarter of it stay there and are read as they are needed
 RESIDENT_BYTES = 256 << 20
 
@@ -49,7 +54,7 @@ class Raw:
 
     Attributes:
         columns: by our names; arrays, or what has `shape`, `dtype` and slices like one while the file is open.
-        attributes: `task`, `action_low`, `action_high`, where there are such.
+        attributes: `task`, `action_low`, `action_high`, `held_out`, where there are such.
         ignored: names of everything else.
         broken: columns that are there and cannot be read, by our names, and why.
     """
@@ -69,6 +74,8 @@ def save_dataset(dataset: OfflineDataset, path: str | Path) -> None:
     path = Path(path)
     write = _write_hdf5 if is_hdf5(path) else _write_npz
     arrays = {ALIASES[column][0]: getattr(dataset, column) for column in ALIASES if column != "episode_index"}
+    if dataset.held_out is not None:
+        arrays[HELD_OUT] = dataset.held_out
     attributes = {name: getattr(dataset, name) for name in ATTRIBUTES if getattr(dataset, name) is not None}
     with replacing(path) as temporary:
         write(temporary, arrays, attributes)
@@ -80,7 +87,7 @@ def load_dataset(path: str | Path, *, task: str | None = None) -> OfflineDataset
     Integer and float64 columns become float32, 0/1 columns bool. Where `next_observations` is missing, a row's
     successor is the next row of its episode, and the last row of each episode, having none, is dropped; the log then
     no longer shows how episodes ended, so prefer files that have it. A last row without an ending is marked truncated.
-    Without `action_low` and `action_high` the limits are the task's, else [-1, 1].
+    Without `action_low` and `action_high` the limits are the task's, else [-1, 1] if the actions fill that.
 
     Args:
         path: an HDF5 (.h5, .hdf5) or NPZ file.
@@ -111,6 +118,11 @@ def open_raw(path: str | Path) -> Iterator[Raw]:
             file, raw = opening(path)
     except UserError:
         raise
+    except BlockingIOError:
+        raise UserError(
+            f"{path} is open for writing in another program: close it there (where a file system knows no locks, set "
+            "HDF5_USE_FILE_LOCKING=FALSE)."
+        ) from None
     except PermissionError:
         raise UserError(f"{path} may not be read: change its permissions.") from None
     except Exception as error:  # whatever a decoder of foreign bytes raises
@@ -161,7 +173,8 @@ def _find_names(present: Iterable[str]) -> tuple[dict[str, str], list[str]]:
     found = {
         column: name for column, names in ALIASES.items() if (name := next((n for n in names if n in there), None))
     }
-    return found, [name for name in there if name not in found.values() and name not in ATTRIBUTES]
+    known = {*found.values(), "task", HELD_OUT, *ALL_PLACES}
+    return found, [name for name in there if name not in known]
 
 
 def check_size(path: Path, declared: dict[str, int]) -> None:
@@ -194,12 +207,13 @@ def _open_hdf5(path: Path) -> tuple[h5py.File, Raw]:
                 raw.broken[column] = Finding("error", what, "store one, without links, objects or foreign filters")
             else:
                 raw.columns[column] = item
-        check_size(path, {name: hdf5_bytes(item) for name, item in raw.columns.items()})
+        split = {} if (item := _plain_hdf5(file, HELD_OUT)) is None else {HELD_OUT: item}
+        check_size(path, {name: hdf5_bytes(item) for name, item in (raw.columns | split).items()})
         if path.stat().st_size > RESIDENT_BYTES:
             raw.columns |= {name: rows for name, item in raw.columns.items() if (rows := _hdf5_rows(path, item))}
-        for name in ATTRIBUTES:
-            if name in file.attrs:
-                raw.attributes[name] = _hdf5_attribute(file, name)
+        raw.attributes |= {name: item[()] for name, item in split.items()}
+        raw.attributes |= {name: _hdf5_attribute(file, name) for name in file.attrs.keys() & {"task"}}
+        raw.attributes |= gather_limits({place: _hdf5_stated(file, place) for place in ALL_PLACES})
     except BaseException:
         file.close()
         raise
@@ -223,7 +237,7 @@ def hdf5_bytes(item: h5py.Dataset) -> int:
     return item.dtype.itemsize * max(math.prod(item.shape or ()), math.prod(item.chunks or ()))
 
 
-def _plain_hdf5(file: h5py.File, name: str) -> h5py.Dataset | None:
+def _plain_hdf5(file: h5py.Group, name: str) -> h5py.Dataset | None:
     """A plain array of numbers."""
     item = own_hdf5(file, name)
     return item if isinstance(item, h5py.Dataset) and item.shape is not None and item.dtype.kind in "biuf" else None
@@ -239,11 +253,27 @@ def _hdf5_rows(path: Path, item: h5py.Dataset) -> FileRows | None:
     return FileRows(path, offset, item.shape)
 
 
-def _hdf5_attribute(file: h5py.File, name: str) -> Any:
+def _hdf5_stated(file: h5py.File, place: str) -> Any:
+    """What is stated at a place, as an attribute or an array; None if nothing is."""
+    group: Any = file
+    *parents, name = place.split("/")
+    for parent in parents:
+        group = own_hdf5(group, parent) if isinstance(group, h5py.Group) else None
+    if not isinstance(group, h5py.Group):
+        return None
+    if name in group.attrs:
+        return _hdf5_attribute(group, name)
+    if name not in group:
+        return None
+    item = _plain_hdf5(group, name)
+    return np.array(ODD) if item is None or hdf5_bytes(item) > LARGEST_ATTRIBUTE else item[()]
+
+
+def _hdf5_attribute(file: h5py.Group, name: str) -> Any:
     attribute = file.attrs.get_id(name)
     plain = attribute.dtype.kind in "biufSU" or h5py.check_string_dtype(attribute.dtype) is not None
     if not plain or math.prod(attribute.shape) * attribute.dtype.itemsize > LARGEST_ATTRIBUTE:
-        return np.array("neither a short text nor a few numbers")
+        return np.array(ODD)
     return file.attrs[name]
 
 
@@ -259,14 +289,18 @@ def _open_npz(path: Path) -> tuple[zipfile.ZipFile, Raw]:
                 raise UserError(f"{path} has a member {member[:80]!r} that leaves its folder: do not trust this file.")
         members = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
         names, raw.ignored = _find_names(members)
-        declared = {name: archive.getinfo(members[name]).file_size for name in names.values()}
+        arrays = {*names.values()} | ({HELD_OUT} & members.keys())
+        declared = {name: archive.getinfo(members[name]).file_size for name in arrays}
         check_size(path, declared)
         for column, name in names.items():
             _read_member(raw, path, archive, members[name], column)
-        for name in ATTRIBUTES:
-            if name in members and archive.getinfo(members[name]).file_size <= LARGEST_ATTRIBUTE:
+        stated = {}
+        for name in members.keys() & {"task", HELD_OUT, *ALL_PLACES}:
+            if name == HELD_OUT or archive.getinfo(members[name]).file_size <= LARGEST_ATTRIBUTE:
                 with archive.open(members[name]) as stream:
-                    raw.attributes[name] = np.lib.format.read_array(stream, allow_pickle=False)
+                    stated[name] = np.lib.format.read_array(stream, allow_pickle=False)
+        raw.attributes |= {name: stated[name] for name in ("task", HELD_OUT) if name in stated}
+        raw.attributes |= gather_limits(stated)
     except BaseException:
         archive.close()
         raise

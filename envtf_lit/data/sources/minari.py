@@ -1,4 +1,4 @@
-"""Minari datasets (https://minari.farama.org), in both directions.
+"""Reading and writing of Minari datasets (https://minari.farama.org).
 
 Nothing in a Minari folder is run: the environment that its metadata name is made by `recover_environment()` alone, when
 its user asks for it, never here.
@@ -201,6 +201,8 @@ def _explained(source: str) -> Iterator[None]:
         yield
     except UserError:
         raise
+    except BlockingIOError:
+        raise UserError(f"{source} is open for writing in another program: close it there.") from None
     except ImportError as error:
         raise UserError(f"{source} needs a package that is missing ({error}).") from None
     except (
@@ -280,7 +282,7 @@ def _columns(dataset: "MinariDataset", source: str) -> dict[str, np.ndarray]:
 def _episode(data: "EpisodeData", source: str) -> dict[str, np.ndarray]:
     """The columns of one episode; observations and their successors share memory."""
     steps = len(data.rewards)
-    observations, actions = np.asarray(data.observations, np.float32), np.asarray(data.actions, np.float32)
+    observations, actions = np.asarray(data.observations), np.asarray(data.actions)
     if steps == 0 or len(observations) != steps + 1 or len(actions) != steps:
         raise UserError(
             f"{source}: episode {data.id} has {len(observations)} observations, {len(actions)} actions and {steps} "
@@ -291,7 +293,7 @@ def _episode(data: "EpisodeData", source: str) -> dict[str, np.ndarray]:
     return {
         "observations": observations[:-1],
         "actions": actions,
-        "rewards": np.asarray(data.rewards, np.float32),
+        "rewards": np.asarray(data.rewards),
         "next_observations": observations[1:],
         "terminated": terminated,
         "truncated": truncated,

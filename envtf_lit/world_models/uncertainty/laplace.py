@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from envtf_lit.world_models.normaliser import CONSTANT
+from envtf_lit.data.statistics import CONSTANT
 
 RIDGE = 1e-2  # lambda: the prior's precision, in units of the (unweighted) noise
 CLUSTERS, LLOYD_ITERATIONS = 10, 20

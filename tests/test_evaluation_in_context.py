@@ -10,8 +10,8 @@ from analytic import LinearWorld, linear_data, linear_world
 from PIL import Image
 from torch import Tensor
 
-from envtf_lit.evaluation.in_context import HISTORY, Recognition, recognition, recognition_metrics, stretches
-from envtf_lit.figures.in_context import recognition_curves
+from envtf_lit.evaluation.in_context import HISTORY, InContextError, in_context_error, in_context_metrics, stretches
+from envtf_lit.figures.in_context import in_context_curves
 from envtf_lit.world_models.forecast import Scale
 
 
@@ -40,7 +40,7 @@ def remembering() -> Remembering:
 def test_errors_are_sorted_by_what_the_model_has_seen() -> None:
     data = linear_data((100, 100, 30))
     scale = Scale.of(data)
-    found = recognition(remembering(), stretches(data, 20, seed=0), scale)
+    found = in_context_error(remembering(), stretches(data, 20, seed=0), scale)
     one_step, open_loop = np.array(found.one_step), np.array(found.open_loop)
     assert one_step.shape == (3, 32) and open_loop.shape == (3, 25)
     unit = 1.0 / (scale.std[0].item() ** 2 * int(scale.live.sum()))  # nmse of an error of one
@@ -53,8 +53,8 @@ def test_errors_are_sorted_by_what_the_model_has_seen() -> None:
 def test_metrics_are_medians_and_shares_of_the_other_models() -> None:
     rng = np.random.default_rng(0)
     errors = {name: rng.lognormal(size=(11, 57)) for name in ("transformer", "context_1")}
-    found = {name: Recognition.of(torch.tensor(e[:, :32]), torch.tensor(e[:, 32:])) for name, e in errors.items()}
-    metrics = recognition_metrics(found)
+    found = {name: InContextError.of(torch.tensor(e[:, :32]), torch.tensor(e[:, 32:])) for name, e in errors.items()}
+    metrics = in_context_metrics(found)
     medians = {name: np.median(e, axis=0) for name, e in errors.items()}
     assert metrics["transformer.one_step"] == medians["transformer"][16]
     assert metrics["context_1.open_loop"] == medians["context_1"][-1]
@@ -68,12 +68,14 @@ def test_the_figure_holds_every_curve(tmp_path) -> None:
     rng = np.random.default_rng(0)
     found = {
         robot: {
-            name: Recognition.of(torch.tensor(rng.lognormal(size=(9, 32))), torch.tensor(rng.lognormal(size=(9, 25))))
+            name: InContextError.of(
+                torch.tensor(rng.lognormal(size=(9, 32))), torch.tensor(rng.lognormal(size=(9, 25)))
+            )
             for name in ("transformer", "context_1", "ensemble")
         }
         for robot in ("halfcheetah", "walker2d")
     }
-    path = recognition_curves(found, tmp_path / "hidden.png")
+    path = in_context_curves(found, tmp_path / "hidden.png")
     table = pd.read_csv(path.with_suffix(".csv"))
     assert len(table) == 2 * 3 * (32 + 25)
     row = table.query("robot == 'walker2d' and model == 'ensemble' and error == 'open_loop' and at == 25").iloc[0]

@@ -1,0 +1,24 @@
+"""The stage `source`: notes the checksum of a file of one's own, so that DVC sees when its content changes."""
+
+from pathlib import Path
+from typing import Any
+
+from envtf_lit.data.sources.fetch import sha256
+from envtf_lit.errors import UserError
+from envtf_lit.files import write_json
+from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.stage import SOURCE
+
+
+def source(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
+    """Writes `data/source.json`: path and SHA-256 of the file that `download.path` names, or null for both.
+
+    Raises:
+        UserError: there is no such file.
+    """
+    path = params.download.path
+    if path is not None and not Path(path).is_file():
+        raise UserError(f"download.path is {path}, which is not a file: check the path.")
+    noted = {"path": path, "sha256": None if path is None else sha256(Path(path))}
+    write_json(root / SOURCE, noted)
+    return noted

@@ -1,0 +1,191 @@
+"""`envtf` at work: what its commands write, and signals, full disks and missing back ends that come in between."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from envtf_lit.data.sources.files import load_dataset
+from envtf_lit.pipeline.yaml import dump_params, load_params, params_yaml, preset_params
+from tests.test_cli import LIGHTNING, exit_status
+
+
+@pytest.fixture(scope="module")
+def tiny_download(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project in which `envtf download` has run."""
+    folder = tmp_path_factory.mktemp("project")
+    (folder / "params.yaml").write_text(params_yaml(preset_params("tiny")))
+    command = [sys.executable, "-m", "envtf_lit", "download", "--quiet", "--download.transitions", "1000"]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    return folder
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_a_training_with_a_sentence(
+    number: int, tiny_download: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Lightning, which has handlers of its own, ends such a run with status 1 or 0."""
+    monkeypatch.chdir(tiny_download)
+    monkeypatch.setattr(
+        "lightning.pytorch.callbacks.Callback.on_train_batch_end", lambda *_: signal.raise_signal(number)
+    )
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    assert exit_status(["train_model", "--quiet"]) == 128 + number
+    assert capsys.readouterr().err.splitlines()[-1].startswith("envtf: Interrupted. The same command continues")
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+WAITING = """
+import concurrent.futures, multiprocessing, sys, time
+from envtf_lit.cli import main, project
+
+def doctor():
+    with concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        waiting = pool.submit(time.sleep, 60)
+        while not waiting.running():
+            time.sleep(0.01)
+        print("ready", flush=True)
+        waiting.result()
+
+if __name__ == "__main__":
+    project.FUNCTIONS["doctor"] = doctor
+    doctor.__doc__ = "Waits."
+    main.main(["doctor"])
+"""
+
+
+def test_a_pool_does_not_hold_up_a_termination(tmp_path: Path) -> None:
+    (tmp_path / "waiting.py").write_text(WAITING)
+    process = subprocess.Popen(
+        [sys.executable, "waiting.py"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    process.terminate()
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 143
+    assert "envtf: Interrupted. The same command begins anew." in errors.splitlines()
+
+
+def test_an_output_that_is_not_utf8_shows_stand_ins(tiny_download: Path) -> None:
+    shown = run(tiny_download, "data", "check", "data/dataset.h5", PYTHONIOENCODING="ascii")
+    assert "1,000 transitions" in shown and "?" in shown
+
+
+def test_params_prints_what_init_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(["params", "--preset", "tiny"]) == 0
+    printed = capsys.readouterr().out
+    assert exit_status(["init", str(tmp_path / "new"), "--preset", "tiny"]) == 0
+    assert (tmp_path / "new" / "params.yaml").read_text() == printed
+    assert dump_params(load_params(tmp_path / "new" / "params.yaml")) == dump_params(preset_params("tiny"))
+
+
+def test_init_leaves_an_existing_project_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "dvc.yaml").write_text("mine")
+    assert exit_status(["init", str(tmp_path)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["dvc.yaml"]
+    assert (tmp_path / "dvc.yaml").read_text() == "mine"
+
+
+def test_doctor_reports_what_a_bug_report_needs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(["doctor"]) == 0
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert {"python", "torch", "mujoco", "cores", "device", "memory", "disk", "rendering"} <= lines.keys()
+    assert "missing" not in lines.values()
+
+
+def test_a_stage_writes_its_outputs_and_prints_its_metrics(tiny_download: Path) -> None:
+    dataset = load_dataset(tiny_download / "data" / "dataset.h5")
+    assert len(dataset) == 1000
+    assert json.loads((tiny_download / "data" / "dataset.json").read_text())["transitions"] == 1000
+
+
+def test_flags_that_dvc_would_undo_are_said_to_be_so(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (project / "my.h5").write_bytes(b"rows")
+    flags = ["--download.source", "file", "--download.path=my.h5"]
+    assert exit_status(["source", *flags]) == 0
+    assert capsys.readouterr().err == ""
+    (project / "dvc.yaml").touch()
+    assert exit_status(["source", *flags]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.startswith("params.yaml does not say download.source=file download.path=my.h5: the next `dvc repro`")
+    assert exit_status(["source"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_file_in_the_home_folder_is_found(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In params.yaml no shell expands its name."""
+    monkeypatch.setenv("HOME", str(project))
+    (project / "my.h5").write_bytes(b"rows")
+    text = (
+        (project / "params.yaml")
+        .read_text()
+        .replace("source: zoo", "source: file")
+        .replace("path: null", "path: ~/my.h5")
+    )
+    (project / "params.yaml").write_text(text)
+    assert exit_status(["source"]) == 0
+    noted = json.loads((project / "data/source.json").read_text())
+    assert noted == {"path": str(project / "my.h5"), "sha256": hashlib.sha256(b"rows").hexdigest()}
+
+
+@pytest.mark.parametrize("kind", LIGHTNING)
+def test_lightnings_help_says_that_a_config_is_trusted(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status([kind, "--help"]) == 0
+    assert "trusted like code" in " ".join(capsys.readouterr().out.split())
+
+
+def test_lightnings_command_lines_refuse_bad_input_alike(project: Path) -> None:
+    output = run(project, "model", "fit", "--data.path", "nowhere.h5", expected=2)
+    assert "envtf: nowhere.h5" in output.splitlines()[-1]
+    assert "Traceback" not in output
+
+
+FULL_DISK = """
+import resource, sys
+from envtf_lit.cli.lightning import run
+from envtf_lit.cli.main import main
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (4_000, 4_000))  # every larger file fails as on a full disk
+main(sys.argv[1:])
+"""
+
+
+def test_a_disk_that_is_full_of_checkpoints_is_said_in_a_sentence(tiny_download: Path, tmp_path: Path) -> None:
+    pytest.importorskip("resource")
+    sizes = {"layers": 1, "width": 16, "context": 4, "updates_per_epoch": 2, "updates": 2}
+    options = [f"--model.options.{key}={value}" for key, value in sizes.items()]
+    fit = ["model", "fit", "--data.path", str(tiny_download / "data/dataset.h5"), "--trainer.logger=false", *options]
+    output = run(tmp_path, *fit, program=["-c", FULL_DISK], expected=2)
+    assert output.splitlines()[-1].startswith("envtf: No space left on the disk")
+    assert not list(tmp_path.rglob("*.ckpt")) and not list(tmp_path.rglob("published"))
+
+
+def test_a_rendering_back_end_that_is_not_there_stops_neither_stage_nor_doctor(project: Path) -> None:
+    run(project, "download", "--quiet", "--download.transitions=1000", MUJOCO_GL="osmesa")
+    assert (project / "data/dataset.h5").exists()
+    report = run(project, "doctor", MUJOCO_GL="glut")  # none of MuJoCo's: nowhere installed
+    assert "MUJOCO_GL        glut" in report and "rendering " in report
+
+
+def run(
+    folder: Path, *arguments: str, expected: int = 0, program: Sequence[str] = ("-m", "envtf_lit"), **variables: str
+) -> str:
+    """Runs `envtf` in a process of its own and returns all that it printed."""
+    result = subprocess.run(
+        [sys.executable, *program, *arguments],
+        cwd=folder,
+        env=os.environ | variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == expected, result.stdout
+    return result.stdout
