@@ -16,7 +16,7 @@ from envtf_lit.studies.machine import in_turns, ratio, typical
 from envtf_lit.studies.speed import _training, bench_model
 from envtf_lit.studies.suite import SuiteOptions
 from envtf_lit.world_models.ensemble import EnsembleDynamics
-from envtf_lit.world_models.options import EnsembleOptions, ModelOptions, TrainModelOptions
+from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
 RATIOS = (
@@ -50,7 +50,7 @@ def test_rounds_take_turns_and_the_first_warms_up() -> None:
 
 
 def test_a_token_costs_six_operations_for_each_weight_of_a_matrix() -> None:
-    options = TrainModelOptions(model=ModelOptions(layers=1, heads=1, width=8, context=4), batch_size=2)
+    options = TransformerOptions(layers=1, heads=1, width=8, context=4, batch_size=2)
     _, flops = _training(ROBOTS["hopper"], options, torch.device("cpu"), "fp32", 1, compile=False)
     embed, attention, mlp, head = 14 * 8, 4 * 8 * 8, 2 * 4 * 8 * 8, 8 * 2 * 12
     assert flops == 6 * (embed + attention + mlp + head)
@@ -72,9 +72,9 @@ def test_a_suites_budgets_come_from_the_command_line() -> None:
 
 
 def test_the_plain_network_has_the_transformers_parameters() -> None:
-    train = _plain(TrainModelOptions(ensemble=EnsembleOptions()), 11, 3)
+    train = _plain(TransformerOptions(), EnsembleOptions(), 11, 3)
     assert train.ensemble is not None and train.ensemble.members == 1
-    plain = EnsembleDynamics(11, 3, members=1, elites=1, hidden=train.ensemble.hidden)
+    plain = EnsembleDynamics(11, 3, members=1, elites=1, hidden=train.hidden)
     transformer = EnvironmentTransformer(11, 3)
     sizes = [sum(p.numel() for p in model.parameters()) for model in (plain, transformer)]
     assert sizes[0] == pytest.approx(sizes[1], rel=0.01)

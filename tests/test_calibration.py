@@ -13,7 +13,7 @@ from PIL import Image
 from envtf_lit.errors import UserError
 from envtf_lit.studies.calibration import CONTRASTS, CalibrationOptions, CalibrationStudy
 from envtf_lit.studies.study import run_study
-from envtf_lit.studies.suite import MODELS, SuiteOptions, add_model, build_suite, model_params
+from envtf_lit.studies.suite import MODELS, SuiteOptions, add_model, build_suite, model_options
 from envtf_lit.world_models.options import EnsembleOptions
 
 ENSEMBLE = EnsembleOptions(
@@ -63,9 +63,9 @@ def test_models_are_measured_once_and_drawn(tmp_path: Path) -> None:
 
     kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("calibration-*.json")}
     assert len(kept) == len(MODELS)
-    plain = model_params("transformer", "hopper-medium", TINY).train_model
+    plain = model_options("transformer", TINY)
     suite = build_suite("hopper-medium", tmp_path, TINY, progress=False)
-    add_model(suite, "certain", replace(plain, model=replace(plain.model, epistemic="none")), progress=False)
+    add_model(suite, "certain", replace(plain, epistemic="none"), progress=False)
     again = run("again.json", others={"certain": str(tmp_path / "{task}/models/certain")})
     assert numbers.items() <= again.items()  # the seconds, too: nothing was measured again
     assert kept == {path: path.stat().st_mtime_ns for path in kept}

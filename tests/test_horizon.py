@@ -22,7 +22,7 @@ from envtf_lit.studies import horizon, study
 from envtf_lit.studies.ablation import VARIANTS, run_ablation
 from envtf_lit.studies.horizon import ONLINE, SIZES, HorizonOptions, HorizonStudy
 from envtf_lit.studies.study import run_study
-from envtf_lit.studies.suite import MODELS, Suite, SuiteOptions, build_suite, model_params
+from envtf_lit.studies.suite import MODELS, Suite, SuiteOptions, build_suite, model_options
 from envtf_lit.world_models.options import EnsembleOptions
 from envtf_lit.world_models.store import load_world_model
 
@@ -151,10 +151,10 @@ def test_variants_are_trained_and_measured_beside_the_suite(tmp_path: Path) -> N
 
 
 def test_variants_see_as_many_steps_per_update() -> None:
-    plain = model_params("transformer", "hopper-medium", SuiteOptions()).train_model
+    plain = model_options("transformer", SuiteOptions())
     for change in VARIANTS.values():
         train = change(plain)
-        assert train != plain and train.batch_size * train.model.context == plain.batch_size * plain.model.context
+        assert train != plain and train.batch_size * train.context == plain.batch_size * plain.context
 
 
 @pytest.mark.parametrize("command", ["horizon", "calibrate"])

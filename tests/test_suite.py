@@ -13,7 +13,7 @@ from envtf_lit.robots.tasks import get_task
 from envtf_lit.studies import suite as suite_module
 from envtf_lit.studies.suite import MODELS, SuiteOptions, add_model, build_suite, other_folders
 from envtf_lit.world_models.ensemble import EnsembleDynamics
-from envtf_lit.world_models.options import EnsembleOptions, ModelOptions, TrainModelOptions
+from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions
 from envtf_lit.world_models.store import save_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
@@ -40,7 +40,7 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(
     assert build_suite("hopper-medium", tmp_path, TINY, progress=False) == suite
     record = tmp_path / "hopper-medium/models/transformer.json"
     older = json.loads(record.read_text())
-    del older["settings"]["train_model"]["model"]["bounded"]  # as if written before there was that option
+    del older["settings"]["train_model"]["bounded"]  # as if written before there was that option
     record.write_text(json.dumps(older))
     origin = json.loads((tmp_path / "hopper-medium/data.json").read_text())
     for path in (record, tmp_path / "hopper-medium/data.json"):  # as if written before datasets were told apart
@@ -49,7 +49,7 @@ def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(
             content["settings"].pop(name, None)
         path.write_text(json.dumps(content))
     assert build_suite("hopper-medium", tmp_path, TINY, progress=False) == suite
-    options = TrainModelOptions(ModelOptions(layers=1, heads=1, width=8, bounded=True), updates=2, updates_per_epoch=2)
+    options = TransformerOptions(layers=1, heads=1, width=8, bounded=True, updates=2, updates_per_epoch=2)
     add_model(suite, "bounded", options, progress=False)
     assert load_world_model(suite.folders["bounded"]).options.bounded
     assert suite.costs["hopper.bounded.train_seconds"] > 0

@@ -22,7 +22,7 @@ from envtf_lit.data.sources.fetch import sha256
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import read_json, write_json
-from envtf_lit.options.schema import Precision, rebuild
+from envtf_lit.options.schema import Precision, build, rebuild
 from envtf_lit.pipeline.download import download
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.stage import CARD, DATASET, run_settings
@@ -209,7 +209,7 @@ def build_suite(
     key = {"task": task, "transitions": options.transitions, "seed": options.seed}
     origin = _plain(describe_origin(get_task(task), options.transitions, options.seed))
     key |= {"origin": {name: value for name, value in origin.items() if name not in WORDS}}
-    shared, card = replace(Params(), task=task, **_common(options)), home / CARD
+    shared, card = _checked(replace(Params(), task=task, **_common(options))), home / CARD
     # a record that is older than this key is judged by the dataset's card
     older = {"origin": {name: read_json(card).get(name) for name in key["origin"]}} if card.exists() else {}
     suite = Suite(task, get_task(task).robot, options, home / DATASET, {}, {}, {})
@@ -256,6 +256,17 @@ def _common(options: SuiteOptions) -> dict[str, Any]:
     """The pipeline's parameters that a suite sets: `SHARED`, and the size of the dataset."""
     download = DownloadOptions(transitions=options.transitions)
     return {name: getattr(options, name) for name in SHARED} | {"download": download}
+
+
+def _checked(params: Params) -> Params:
+    """The same, types and ranges checked.
+
+    Raises:
+        UserError: an option is of the wrong type or out of range.
+    """
+    build(Params, {name: getattr(params, name) for name in SHARED}, "")
+    rebuild(params.download)
+    return params
 
 
 def model_options(name: str, options: SuiteOptions) -> WorldModelOptions:
