@@ -180,7 +180,7 @@ def train(root: Path) -> dict[str, bytes]:
 
 def test_every_stage_learns_the_same_bits_from_memory_and_from_the_file(tmp_path: Path, in_file: pytest.MonkeyPatch):
     in_file.setattr("envtf_lit.data.columns.BLOCK_BYTES", 2000)  # statistics are merged from several blocks
-    save_dataset(walker_dataset(), tmp_path / "data/dataset.h5")
+    save_dataset(walker_dataset().with_split(0.2, 0), tmp_path / "data/dataset.h5")
     assert isinstance(load_dataset(tmp_path / "data/dataset.h5").observations, FileRows)
     from_file = train(tmp_path)
     in_file.setattr("envtf_lit.data.sources.files.RESIDENT_BYTES", 1 << 30)

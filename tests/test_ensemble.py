@@ -12,7 +12,6 @@ from torch.nn import functional as F
 
 from envtf_lit import load_world_model
 from envtf_lit.data.loaders import Resamples, Windows
-from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.pipeline.params import Params
@@ -37,7 +36,6 @@ OPTIONS = EnsembleOptions(
 TINY = Params(
     threads=1,
     precision="fp32",
-    download=DownloadOptions(held_out=0.2),
     train_model={"ensemble": OPTIONS},
 )
 
@@ -254,7 +252,7 @@ def test_saved_ensembles_come_back_whole(tmp_path: Path):
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    save_dataset(walker_dataset(), tmp_path / "data/dataset.h5")
+    save_dataset(walker_dataset().with_split(0.2, 0), tmp_path / "data/dataset.h5")
     return tmp_path
 
 

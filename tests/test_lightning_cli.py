@@ -240,7 +240,7 @@ def test_data_of_minari_are_named_by_their_id(folder: Path, monkeypatch: pytest.
 def test_agent_fit_starts_its_actor_from_a_published_policy_and_warms_up_critics_alone(folder: Path) -> None:
     fit("agent")
     Path(".envtf/published").rename("first")
-    fit("agent", "--model.init_from=first", "--model.seed=1", warm_start=0.99)  # of 20 updates all
+    fit("agent", "--model.init_from=first", "--model.seed=1", warm_start=20)  # all of them
     assert same(load_policy("first"), load_policy(".envtf/published"))
     fit("agent", "--model.init_from=first", "--model.seed=1", warm_start=0)
     assert not same(load_policy("first"), load_policy(".envtf/published"))

@@ -138,7 +138,7 @@ def test_options_are_held_to_the_rules_of_params(
         ("model", "dropout", 1.0, "v<1"),
         ("model", "layers", 1.5, "invalid literal"),
         ("agent", "updates_per_epoch", 0, "v>0"),
-        ("agent", "warm_start", 1.0, "v<1"),
+        ("agent", "warm_start", -0.1, "v>=0"),
         ("agent", "hidden", [0], "v>0"),
     ],
 )

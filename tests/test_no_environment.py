@@ -157,7 +157,12 @@ def test_metrics_hold_no_score_and_only_finite_numbers(finished: tuple[Path, Par
     assert metrics["task"] is None
     assert "score" not in json.dumps(metrics)
     assert set(metrics["policies"]) == {"bc", "cql", "et_cql"}
-    names = {"label", "imagined_return_mean", "imagined_return_std", "action_error"}
+    assert {name: policy["world_model"] for name, policy in metrics["policies"].items()} == {
+        "bc": None,
+        "cql": None,
+        "et_cql": "transformer",
+    }
+    names = {"label", "algorithm", "world_model", "imagined_return_mean", "imagined_return_std", "action_error"}
     assert all(set(policy) == names for policy in metrics["policies"].values())
     assert metrics["held_out"]["episodes"] == 2  # of the three held out, one scales the predicted intervals
     assert metrics["policies"]["bc"]["action_error"] > 0

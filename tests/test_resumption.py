@@ -17,6 +17,7 @@ from envtf_lit.training import WholeCheckpoints, trained
 from envtf_lit.world_models.lit import lit_world_model, window_data
 from envtf_lit.world_models.options import EnsembleOptions
 from tests.test_training import (
+    LOG,
     MODEL,
     TINY,
     Idle,
@@ -27,12 +28,11 @@ from tests.test_training import (
     train_whole,
     train_with,
 )
-from tests.walker import walker_dataset
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    save_dataset(walker_dataset(), tmp_path / "data/dataset.h5")
+    save_dataset(LOG, tmp_path / "data/dataset.h5")
     return tmp_path
 
 
@@ -148,6 +148,8 @@ def test_a_read_only_folder_is_refused_before_training(root, monkeypatch, closed
 
 
 def test_rollouts_that_cannot_be_written_are_refused_before_any_is_imagined(root, monkeypatch):
+    train_model(TINY, root, progress=False)
+    train_policy(TINY, root, name="bc", progress=False)
     (root / "data/rollouts/transformer.h5").mkdir(parents=True)
     monkeypatch.setattr("envtf_lit.pipeline.generate_rollouts.imagine", killed)
     with pytest.raises(UserError, match=r"transformer\.h5: a folder of that name stands there"):

@@ -16,7 +16,6 @@ from envtf_lit.agents.bc import BCOptions
 from envtf_lit.agents.cql import CQLOptions
 from envtf_lit.agents.et_cql import ETCQLOptions
 from envtf_lit.agents.value_gradient import ValueGradientOptions
-from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.imagination.options import GenerateRolloutsOptions, RolloutOptions
 from envtf_lit.modules import load_weights
@@ -33,6 +32,7 @@ from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.walker import walker_dataset
 
+LOG = walker_dataset().with_split(0.2, 0)
 MODEL = TransformerOptions(
     layers=1, heads=2, width=16, context=6, dropout=0.1, updates=12, updates_per_epoch=4, batch_size=8
 )
@@ -45,7 +45,6 @@ ET_CQL = ETCQLOptions(
 )
 TINY = Params(
     threads=1,
-    download=DownloadOptions(held_out=0.2),
     train_model={"transformer": MODEL},
     generate_rollouts=GenerateRolloutsOptions(branches=30, horizon=3),
     train_policy={"bc": BCOptions(**SIZES), "cql": CQLOptions(**SIZES), "et_cql": ET_CQL},
@@ -88,7 +87,7 @@ class Norms(Callback):
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    save_dataset(walker_dataset(), tmp_path / "data/dataset.h5")
+    save_dataset(LOG, tmp_path / "data/dataset.h5")
     return tmp_path
 
 
@@ -150,7 +149,7 @@ def test_the_kept_model_is_the_one_of_least_open_loop_error(root):
 def imagined(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project that has all that policies are trained from."""
     root = tmp_path_factory.mktemp("imagined")
-    save_dataset(walker_dataset(), root / "data/dataset.h5")
+    save_dataset(LOG, root / "data/dataset.h5")
     train_model(TINY, root, progress=False)
     train_policy(TINY, root, name="bc", progress=False)
     generate_rollouts(TINY, root, progress=False)
@@ -237,7 +236,7 @@ def test_run_folders_differ_by_parameters_and_by_bytes(tmp_path):
 
 def test_the_training_metric_is_what_the_saved_model_scores(root):
     metrics = train_model(TINY, root, progress=False)
-    training, held_out = walker_dataset().split(TINY.download.held_out, seed=TINY.seed)
+    training, held_out = LOG.split()
     stretches = segments(held_out, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=TINY.seed)
     error = open_loop_error(load_world_model(root / WORLD_MODEL), stretches, Scale.of(training))
     assert error == pytest.approx(metrics["open_loop_error"], rel=1e-5)
@@ -246,7 +245,7 @@ def test_the_training_metric_is_what_the_saved_model_scores(root):
 def test_two_processes_with_one_seed_write_the_same_bytes(tmp_path):
     outputs = []
     for name in ("one", "two"):
-        save_dataset(walker_dataset(), tmp_path / name / "data/dataset.h5")
+        save_dataset(LOG, tmp_path / name / "data/dataset.h5")
         (tmp_path / name / "params.yaml").write_text(params_yaml(TINY))
         for stage in (["train_model"], ["train_policy", "bc"], ["generate_rollouts"], ["train_policy", "et_cql"]):
             subprocess.run([sys.executable, "-m", "envtf_lit", *stage, "--quiet"], cwd=tmp_path / name, check=True)

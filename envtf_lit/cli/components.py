@@ -22,7 +22,7 @@ def world_model_of(kind: str) -> Callable[..., LitWorldModel]:
     def world_model(
         observation_dim: int,
         action_dim: int,
-        options: Options = Options(),  # noqa: B008 (frozen)  # pyright: ignore[reportInvalidTypeForm]
+        options: Options = Options(),  # noqa: B008 (frozen)
         kind: str = kind,
         seed: int = 0,
         init_from: str | None = None,
@@ -57,7 +57,7 @@ def agent_of(algorithm: str) -> Callable[..., Agent]:
     def agent(
         observation_dim: int,
         action_dim: int,
-        options: Options = Options(),  # noqa: B008 (frozen)  # pyright: ignore[reportInvalidTypeForm]
+        options: Options = Options(),  # noqa: B008 (frozen)
         algorithm: str = algorithm,
         action_low: list[float] | None = None,
         action_high: list[float] | None = None,
