@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.registry import ALGORITHMS
+from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import TransitionData, WindowData
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.data.sources.minari import read_minari
 from envtf_lit.world_models.lit import LitWorldModel, lit_world_model
@@ -22,7 +22,7 @@ def world_model_of(kind: str) -> Callable[..., LitWorldModel]:
     def world_model(
         observation_dim: int,
         action_dim: int,
-        options: Options = Options(),  # noqa: B008 (frozen)
+        options: Options = Options(),  # noqa: B008 (frozen)  # pyright: ignore[reportInvalidTypeForm]
         kind: str = kind,
         seed: int = 0,
         init_from: str | None = None,
@@ -57,7 +57,7 @@ def agent_of(algorithm: str) -> Callable[..., Agent]:
     def agent(
         observation_dim: int,
         action_dim: int,
-        options: Options = Options(),  # noqa: B008 (frozen)
+        options: Options = Options(),  # noqa: B008 (frozen)  # pyright: ignore[reportInvalidTypeForm]
         algorithm: str = algorithm,
         action_low: list[float] | None = None,
         action_high: list[float] | None = None,
