@@ -32,7 +32,16 @@ RATIOS = (
 def test_the_speed_file_is_flat_and_has_the_named_keys(tmp_path: Path) -> None:
     out = tmp_path / "model.json"
     result = bench_model(
-        out, preset="tiny", device="cpu", batch=16, horizon=2, rounds=1, real_steps=20, updates=1, threads=1
+        out,
+        preset="tiny",
+        device="cpu",
+        batch=16,
+        horizon=2,
+        rounds=1,
+        real_steps=20,
+        updates=1,
+        threads=1,
+        precision="fp32",
     )
     assert json.loads(out.read_text()) == result
     assert all(isinstance(result[name], float) and result[name] > 0 for name in RATIOS)
