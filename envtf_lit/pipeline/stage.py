@@ -13,6 +13,7 @@ import torch
 
 from envtf_lit.agents.options import NO_WORLD_MODEL, PolicyOptions
 from envtf_lit.files import read_json, write_json
+from envtf_lit.imagination.options import GenerateRolloutsOptions
 from envtf_lit.pipeline.params import Params
 from envtf_lit.robots.tasks import Robot, get_task
 from envtf_lit.world_models.options import WorldModelOptions
@@ -42,7 +43,9 @@ def unseen(params: Params) -> dict[str, float]:
     return {"held_out": params.download.held_out} if params.task is None else {}
 
 
-def run_settings(params: Params, options: WorldModelOptions | PolicyOptions | Any) -> dict[str, Any]:
+def run_settings(
+    params: Params, options: WorldModelOptions | PolicyOptions | GenerateRolloutsOptions
+) -> dict[str, Any]:
     """What a run's result depends on, beside its input files."""
     common = {name: getattr(params, name) for name in ("seed", "threads", "precision", "compile")}
     return common | {"options": asdict(options)}
