@@ -163,7 +163,7 @@ def test_a_disk_that_is_full_of_checkpoints_is_said_in_a_sentence(tiny_download:
     options = [f"--model.options.{key}={value}" for key, value in sizes.items()]
     fit = ["model", "fit", "--data.path", str(tiny_download / "data/dataset.h5"), "--trainer.logger=false", *options]
     output = run(tmp_path, *fit, program=["-c", FULL_DISK], expected=2)
-    assert output.splitlines()[-1].startswith("envtf: No space left on the disk")
+    assert output.splitlines()[-1].startswith("envtf: No space left ")  # which file met it first is the machine's
     assert not list(tmp_path.rglob("*.ckpt")) and not list(tmp_path.rglob("published"))
 
 
