@@ -52,14 +52,15 @@ def load_module(folder: str | Path, registry: Mapping[str, type[M]]) -> M:
         try:
             return registry[kind](**config["arguments"])
         except (UserError, TypeError, KeyError, ValueError, ArithmeticError, RuntimeError) as error:
-            text = f"{folder}/config.json does not describe a {kind} ({error}): save the model anew."
+            text = f"{folder}/config.json does not describe a {kind} ({error}): train it anew."
             raise UserError(text) from None
 
     found = _shapes(weights)
     with torch.device("meta"), _Outline(most_calls=CALLS_PER_TENSOR * len(found)):
         outline = build()
     _compare(outline, found, weights)
-    module = build()  # of the file's own sizes, with the buffers that are in no file
+    with torch.random.fork_rng(devices=()):  # initial weights are drawn for nothing: whoever loads, keeps its own draws
+        module = build()  # of the file's own sizes, with the buffers that are in no file
     load_weights(module, weights)
     return module.eval()
 
