@@ -24,7 +24,8 @@ from envtf_lit.pipeline.generate_rollouts import STRETCH
 from envtf_lit.pipeline.yaml import preset_params
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.results import claim
-from envtf_lit.robots.tasks import ROBOTS, Robot, never_terminated
+from envtf_lit.robots.tasks import ROBOTS, Robot
+from envtf_lit.robots.termination import never_terminated
 from envtf_lit.studies.machine import bench_device, facts, in_turns, ratio, seconds, typical
 from envtf_lit.training import autocast
 from envtf_lit.world_models.ensemble import EnsembleDynamics
