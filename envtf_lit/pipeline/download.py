@@ -4,8 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import h5py
-
 from envtf_lit.data.cards import dataset_card
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.options import DownloadOptions, check_download
@@ -14,9 +12,9 @@ from envtf_lit.data.sources.fetch import fingerprint
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.data.sources.minari import describe_minari, read_minari
 from envtf_lit.errors import UserError
-from envtf_lit.files import replacing, write_json, write_text
+from envtf_lit.files import write_json
 from envtf_lit.pipeline.params import Params
-from envtf_lit.pipeline.stage import CARD, DATASET, NOTHING, run_stage
+from envtf_lit.pipeline.stage import CARD, DATASET, run_stage
 from envtf_lit.robots.tasks import Task, get_task
 from envtf_lit.zoo.collect import collect
 from envtf_lit.zoo.snapshots import describe_origin
@@ -55,7 +53,6 @@ def download(params: Params, root: Path = Path("."), *, progress: bool = True) -
         save_dataset(dataset, target)
         card = dataset_card(dataset, params.download.source, origin)
         write_json(root / CARD, card)
-        _write_nothing(root)
     return card
 
 
@@ -102,11 +99,3 @@ def make_dataset(
 def _renamed(dataset: OfflineDataset, name: str | None) -> OfflineDataset:
     """Whatever a file calls its task, a user who names none wants none."""
     return replace(dataset, task=name)
-
-
-def _write_nothing(root: Path) -> None:
-    """What policies that learn from data alone read in place of a world model and its rollouts."""
-    model, rollouts = (root / path for path in NOTHING)
-    write_text(model, "Policies whose world_model is `none` learn from data alone.\n")
-    with replacing(rollouts) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs["note"] = "no rollouts: for policies whose world_model is `none`"
