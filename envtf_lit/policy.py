@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from envtf_lit.errors import UserError
-from envtf_lit.modules import load_module, save_module
+from envtf_lit.model_folders import load_module, save_module
 
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 

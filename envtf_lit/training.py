@@ -130,21 +130,13 @@ def trained(
         check_writable(target, folder=True)
     check_writable(run / "last.ckpt", folder=False)
     checkpoint = _checkpoint(run, ("last",) if monitor is None else ("last", "best"))
-    curves, callbacks = Curves(), list(callbacks)
-    if monitor is not None:
-        callbacks.append(
-            ModelCheckpoint(dirpath=run, filename="best", monitor=monitor, mode=mode, enable_version_counter=False)
-        )
-    # after the others, whose state of this epoch it must hold
-    callbacks += [curves, ModelCheckpoint(dirpath=run, filename="last", enable_version_counter=False)]
-    if progress:
-        callbacks.append(RichProgressBar())
+    curves = Curves()
     trainer = L.Trainer(
         max_epochs=epochs,
         precision="bf16-mixed" if precision == "bf16" else "32-true",
         accelerator="auto",
         devices=1,
-        callbacks=callbacks,
+        callbacks=[*callbacks, *_keepers(run, curves, monitor, mode), *([RichProgressBar()] if progress else [])],
         plugins=[WholeCheckpoints()],
         logger=False,
         enable_progress_bar=progress,
@@ -161,6 +153,15 @@ def trained(
         module.load_state_dict(kept["state_dict"])
     yield curves
     shutil.rmtree(run, ignore_errors=True)
+
+
+def _keepers(run: Path, curves: Curves, monitor: str | None, mode: Literal["min", "max"]) -> list[Callback]:
+    """What writes `best.ckpt`, if there is something to monitor, and `last.ckpt`, which must hold the others' state."""
+    last = ModelCheckpoint(dirpath=run, filename="last", enable_version_counter=False)
+    if monitor is None:
+        return [curves, last]
+    best = ModelCheckpoint(dirpath=run, filename="best", monitor=monitor, mode=mode, enable_version_counter=False)
+    return [best, curves, last]
 
 
 def _checkpoint(run: Path, names: Sequence[str]) -> Path | None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from envtf_lit.cli.command import parse_words
 from envtf_lit.cli.main import main
+from envtf_lit.cli.signatures import parse_words
 from envtf_lit.cli.studies import bench_cost as bench_cost_command
 from envtf_lit.robots.tasks import ROBOTS
 from envtf_lit.studies.cost import _plain, bench_cost

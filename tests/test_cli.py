@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from envtf_lit.cli.command import parse_words
 from envtf_lit.cli.commands import COMMANDS, GROUPS
 from envtf_lit.cli.main import main
+from envtf_lit.cli.signatures import parse_words
 from envtf_lit.cli.stages import STAGES, split
 from envtf_lit.errors import UserError
 from envtf_lit.robots.tasks import ROBOTS

@@ -10,9 +10,9 @@ from itertools import pairwise
 from typing import Any
 
 from envtf_lit.agents.registry import ALGORITHMS
-from envtf_lit.cli.command import parse_words
 from envtf_lit.cli.commands import COMMANDS, GROUPS
-from envtf_lit.cli.components import LogTransitions, LogWindows, agent_of, world_model_of
+from envtf_lit.cli.lightning_modules import LogTransitions, LogWindows, agent_of, world_model_of
+from envtf_lit.cli.signatures import parse_words
 from envtf_lit.cli.stages import STAGES, StageParser, split
 from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.pipeline.yaml import load_params

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from envtf_lit.errors import UserError
-from envtf_lit.pipeline.former import FORMER
 from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.renamed_options import FORMER
 from envtf_lit.pipeline.yaml import dump_params, load_params, preset_params
 from envtf_lit.world_models.options import TransformerOptions
 from tests.test_config import ROOT, leaves, load

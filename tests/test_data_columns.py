@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from walker import walker_dataset
 
+from envtf_lit.data.check_report import inspect_source
 from envtf_lit.data.columns import FileRows
 from envtf_lit.data.dataset import COLUMNS
-from envtf_lit.data.inspection import inspect_source
 from envtf_lit.data.loaders import Store, Transitions, Windows
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.errors import UserError

@@ -18,7 +18,7 @@ from envtf_lit.data.sources import d4rl
 from envtf_lit.data.sources.d4rl import FILES, load_d4rl, read_d4rl, remote_file
 from envtf_lit.data.sources.fetch import RemoteFile
 from envtf_lit.errors import UserError
-from envtf_lit.pipeline.sources import make_dataset
+from envtf_lit.pipeline.download import make_dataset
 from envtf_lit.robots.tasks import TASKS, get_task
 
 HOPPER, ANT = get_task("hopper-medium-v4"), get_task("ant-medium-v4")

@@ -14,7 +14,7 @@ from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.data.sources.minari import write_minari
 from envtf_lit.errors import UserError
-from envtf_lit.pipeline.sources import make_dataset
+from envtf_lit.pipeline.download import make_dataset
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.zoo.collect import collect
 

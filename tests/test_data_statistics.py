@@ -12,10 +12,10 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import return_weights
 from envtf_lit.data.statistics import Moments
 from envtf_lit.evaluation.offline import action_error
-from envtf_lit.world_models import termination
+from envtf_lit.world_models import termination_head
 from envtf_lit.world_models.forecast import Scale, nmse, whole_episodes
 from envtf_lit.world_models.normaliser import Normaliser
-from envtf_lit.world_models.termination import TerminationHead
+from envtf_lit.world_models.termination_head import TerminationHead
 
 UNITS = [1e-9, 1e-5, 2.0**-20, 1.0, 2.0**20, 1e9]
 
@@ -108,7 +108,7 @@ def test_the_world_models_inputs_and_targets_have_no_unit(unit: float, delta: bo
 
 @pytest.mark.parametrize("unit", UNITS)
 def test_the_agents_and_the_termination_heads_inputs_have_no_unit(unit: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(termination, "UPDATES", 1)
+    monkeypatch.setattr(termination_head, "UPDATES", 1)
 
     def z_scores(data: OfflineDataset) -> tuple[torch.Tensor, ...]:
         mean, std = data.observation_scale()

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from logs import KEYS, Columns, columns, write
 from rich.console import Console
 
+from envtf_lit.data.check_report import inspect_source, render
 from envtf_lit.data.dataset import COLUMNS
-from envtf_lit.data.inspection import inspect_source, render
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
 

@@ -103,11 +103,11 @@ def made(stage: dict[str, Any]) -> set[str]:
 
 
 def test_policies_from_data_alone_depend_on_no_world_model_and_no_rollouts() -> None:
-    nothing = {"models/world_model/none", "data/rollouts/none.h5"}  # which `download` writes
+    nothing = {"models/world_model/none", "data/rollouts/none.h5"}  # which `source` writes
     for name in ("bc", "cql"):
         assert made(stages()[f"train_policy@{name}"]) == {"data/dataset.h5"} | nothing
         assert [key for key in stages()[f"train_policy@{name}"]["params"] if "et_cql" in key or "model" in key] == []
-    assert nothing == {str(path) for path in NOTHING} <= set(stages()["download"]["outs"])
+    assert nothing == {str(path) for path in NOTHING} <= set(stages()["source"]["outs"])
     imagined = {"models/world_model/transformer", "data/rollouts/transformer.h5"}
     assert made(stages()["train_policy@et_cql"]) == {"data/dataset.h5"} | imagined
 

@@ -24,7 +24,7 @@ from envtf_lit.evaluation.calibration import (
     rollout_errors,
     with_uniform_actions,
 )
-from envtf_lit.robots.tasks import never_terminated
+from envtf_lit.robots.termination import never_terminated
 from envtf_lit.world_models.forecast import Scale, forecast, whole_episodes
 from envtf_lit.world_models.uncertainty.recalibration import normal_scores
 

@@ -9,9 +9,14 @@ import torch
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
-from envtf_lit.robots.tasks import hopper_terminated
-from envtf_lit.world_models import termination
-from envtf_lit.world_models.termination import TerminationHead, learn_termination, load_termination, save_termination
+from envtf_lit.robots.termination import hopper_terminated
+from envtf_lit.world_models import termination_head
+from envtf_lit.world_models.termination_head import (
+    TerminationHead,
+    learn_termination,
+    load_termination,
+    save_termination,
+)
 from tests.analytic import linear_data
 
 
@@ -55,7 +60,7 @@ def test_hoppers_rule_is_found_again(log: OfflineDataset, head: TerminationHead)
 def test_equal_seeds_learn_equal_heads_whatever_was_drawn_before(
     log: OfflineDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(termination, "UPDATES", 20)
+    monkeypatch.setattr(termination_head, "UPDATES", 20)
     short = log.select(range(20))
     torch.manual_seed(1)
     state = torch.random.get_rng_state()
@@ -73,7 +78,7 @@ def test_equal_seeds_learn_equal_heads_whatever_was_drawn_before(
 def test_where_the_state_says_nothing_nothing_is_said_but_of_what_is_no_state(
     log: OfflineDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(termination, "UPDATES", 50)
+    monkeypatch.setattr(termination_head, "UPDATES", 50)
     blind = replace(log, next_observations=np.zeros((8_000, 11), np.float32))
     head = learn_termination(blind, seed=0)
     assert head is not None

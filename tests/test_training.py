@@ -18,7 +18,7 @@ from envtf_lit.agents.et_cql import ETCQLOptions
 from envtf_lit.agents.value_gradient import ValueGradientOptions
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.imagination.options import GenerateRolloutsOptions, RolloutOptions
-from envtf_lit.modules import load_weights
+from envtf_lit.model_folders import load_weights
 from envtf_lit.pipeline.generate_rollouts import generate_rollouts
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.train_model import train_model

@@ -105,7 +105,7 @@ def test_selection_prefers_the_better_model_and_is_finite_for_all():
     assert np.isfinite(errors).all()
 
 
-def test_an_open_loop_after_history_is_taught_first_and_then_on_its_own():
+def test_an_open_loop_after_history_is_teacher_forced_first_and_then_on_its_own():
     data, model = linear_data((20, 20), noise=0.01), linear_world(error=0.03)
     trajectories = whole_episodes(data, 2, seed=0)
     teacher_forced = forecast(model, trajectories, feedback="recorded").mean

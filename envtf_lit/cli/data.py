@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Annotated
 
-from envtf_lit.cli.command import run_command
 from envtf_lit.cli.output import console
+from envtf_lit.cli.signatures import run_command
 
 Source = Annotated[str, "IN"]
 Target = Annotated[str, "OUT"]
@@ -17,7 +17,7 @@ def check(source: Source, /, *, task: str | None = None) -> None:
         source: HDF5 or NPZ file, minari:ID, or a Minari dataset's folder.
         task: robot and tier that the data came from, such as hopper-medium.
     """
-    from envtf_lit.data.inspection import inspect_source, render
+    from envtf_lit.data.check_report import inspect_source, render
 
     inspection = inspect_source(source, task=task)
     console().print(render(inspection))

@@ -13,7 +13,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from envtf_lit.agents.options import NO_WORLD_MODEL
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.cli.arguments import SHIPPED, given, of_today, with_shipped_configs
-from envtf_lit.cli.components import LogTransitions, LogWindows, agent_of, world_model_of
+from envtf_lit.cli.lightning_modules import LogTransitions, LogWindows, agent_of, world_model_of
 from envtf_lit.cli.publish import KeepConfig, Publish
 from envtf_lit.cli.saved_options import (
     checkpoint_class,

@@ -4,8 +4,8 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 
-from envtf_lit.cli.command import Folder, run_command
 from envtf_lit.cli.output import console
+from envtf_lit.cli.signatures import Folder, run_command
 
 
 def init(folder: Folder, /, *, preset: str = "small") -> None:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from envtf_lit.cli.command import CORES, File, Folder, Natural, Positive, Robot, run_command
 from envtf_lit.cli.output import console, hush_lightning
+from envtf_lit.cli.signatures import CORES, File, Folder, Natural, Positive, Robot, run_command
 from envtf_lit.errors import UserError
 
 if TYPE_CHECKING:

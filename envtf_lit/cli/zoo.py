@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from envtf_lit.cli.command import CORES, Folder, Natural, Robot, run_command
 from envtf_lit.cli.output import console
+from envtf_lit.cli.signatures import CORES, Folder, Natural, Robot, run_command
 from envtf_lit.errors import UserError
 
 Task = Annotated[str, "TASK"]

@@ -15,7 +15,8 @@ from torch import Tensor
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.horizon import EXPLODED, LARGEST, THRESHOLDS, Steps, error_quartiles, horizon_report
 from envtf_lit.evaluation.physics import Ceiling
-from envtf_lit.robots.tasks import Task, never_terminated
+from envtf_lit.robots.tasks import Task
+from envtf_lit.robots.termination import never_terminated
 from envtf_lit.world_models.forecast import Scale, Trajectories, forecast, nmse
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.zoo.collect import collect

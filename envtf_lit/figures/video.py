@@ -62,7 +62,7 @@ def real_vs_imagined(
     pictures = _render(robot, poses, SIZE, backend)
     pairs = zip(pictures[: len(shown)], pictures[len(shown) :], shown, strict=True)
     lost = np.maximum.accumulate(error) > 0.1  # from the first passage on
-    write_gif([_page(real, dream, int(h), float(error[h]), bool(lost[h])) for real, dream, h in pairs], path)
+    write_gif([_page(real, fake, int(h), float(error[h]), bool(lost[h])) for real, fake, h in pairs], path)
     return backend
 
 

@@ -33,7 +33,7 @@ from envtf_lit.robots.returns import evaluate_policy
 from envtf_lit.training import CURVES
 from envtf_lit.world_models.forecast import Scale, whole_episodes
 from envtf_lit.world_models.store import load_world_model
-from envtf_lit.world_models.termination import termination_source
+from envtf_lit.world_models.termination_head import termination_source
 from envtf_lit.world_models.uncertainty.recalibration import calibration_split
 
 

@@ -24,7 +24,7 @@ from envtf_lit.pipeline.stage import (
 from envtf_lit.policy import load_policy
 from envtf_lit.training import autocast, pick_device
 from envtf_lit.world_models.store import load_world_model
-from envtf_lit.world_models.termination import termination_rule
+from envtf_lit.world_models.termination_head import termination_rule
 
 STRETCH = 16  # rollouts begin at as many consecutive steps of one window, which the model reads once
 

@@ -62,7 +62,8 @@ class Params:
         train_model: world models by name; `kind` is transformer or ensemble.
         generate_rollouts: the first imagined rollouts in each world model.
         policy: what all policies share, unless a policy's own section says otherwise.
-        train_policy: policies by name; a further section is trained, evaluated and reported, too.
+        train_policy: policies by name, each with its `algorithm` and its `world_model`; a further section is trained,
+            evaluated and reported, too.
         evaluate: the evidence.
     """
 

@@ -23,7 +23,7 @@ from envtf_lit.pipeline.stage import (
 )
 from envtf_lit.training import pick_device, run_folder, trained
 from envtf_lit.world_models.store import load_world_model
-from envtf_lit.world_models.termination import termination_rule
+from envtf_lit.world_models.termination_head import termination_rule
 
 
 def train_policy(

@@ -17,8 +17,8 @@ from ruamel.yaml.error import YAMLError
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.options.schema import kind, options_class
-from envtf_lit.pipeline.former import refuse_former
 from envtf_lit.pipeline.params import COMMON, Params, algorithm_of, build_params, kind_of
+from envtf_lit.pipeline.renamed_options import refuse_former
 from envtf_lit.world_models.options import KINDS
 
 PRESETS = ("tiny", "small", "base", "paper")

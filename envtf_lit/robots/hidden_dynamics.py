@@ -1,4 +1,4 @@
-"""Robots whose body is another one in each episode, and who do not tell: what a model must find out from history."""
+"""Robots whose body is another in each episode, unobserved: a model must infer it from history."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -24,7 +24,8 @@ from envtf_lit.pipeline.generate_rollouts import STRETCH
 from envtf_lit.pipeline.yaml import preset_params
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.results import claim
-from envtf_lit.robots.tasks import ROBOTS, Robot, never_terminated
+from envtf_lit.robots.tasks import ROBOTS, Robot
+from envtf_lit.robots.termination import never_terminated
 from envtf_lit.studies.machine import bench_device, facts, in_turns, ratio, seconds, typical
 from envtf_lit.training import autocast
 from envtf_lit.world_models.ensemble import EnsembleDynamics
@@ -83,18 +84,14 @@ def bench_model(
     """
     if out is not None:
         claim(out, "train_fraction_of_matmul_peak")
-    place, body = bench_device(device), ROBOTS[robot]
-    preset_options = preset_params(preset).train_model["transformer"]
-    assert isinstance(preset_options, TransformerOptions)
-    options = replace(preset_options, batch_size=windows or preset_options.batch_size)
+    place, body, options = bench_device(device), ROBOTS[robot], _options(preset, windows)
     warm_up = 3 if compile else 1  # what is compiled is compiled again for other shapes, and recorded at its second run
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     with torch.no_grad(), autocast(place, precision), _simulators(body, threads) as simulators:
-        actions = _imagination(body, options, place, batch, horizon, compile)
-        actions["real"] = lambda: _real(simulators, threads, real_steps)
-        timings = in_turns(actions, rounds, warm_up=warm_up)
-    del actions  # full caches, which training would have to share a GPU's memory with
+        real = {"real": lambda: _real(simulators, threads, real_steps)}
+        # held by no name: training would have to share a GPU's memory with full caches
+        timings = in_turns(_imagination(body, options, place, batch, horizon, compile) | real, rounds, warm_up=warm_up)
     result = _imagination_rates(robot, timings, batch * horizon, threads * real_steps)
     result |= _learning_rates(body, options, place, precision, updates, compile, rounds, warm_up)
     result |= dict(preset=preset, batch=batch, horizon=horizon, context=options.context)
@@ -102,6 +99,13 @@ def bench_model(
     if out is not None:
         write_json(out, result)
     return result
+
+
+def _options(preset: str, windows: int | None) -> TransformerOptions:
+    """A preset's world model, trained on so many windows at a time; None leaves their number."""
+    options = preset_params(preset).train_model["transformer"]
+    assert isinstance(options, TransformerOptions)
+    return replace(options, batch_size=windows or options.batch_size)
 
 
 def _imagination_rates(robot: str, timings: list[dict[str, float]], steps: int, real_steps: int) -> dict[str, Any]:

@@ -44,7 +44,7 @@ class TransformerState:
         """Slots of the ring."""
         return self.cache[0][0].shape[0]
 
-    def remember(self, tokens: list[tuple[Tensor, Tensor]], window: Tensor, lengths: Tensor) -> "TransformerState":
+    def with_history(self, tokens: list[tuple[Tensor, Tensor]], window: Tensor, lengths: Tensor) -> "TransformerState":
         """The same rollouts with their histories in the (empty) cache, right-aligned.
 
         Args:

@@ -26,7 +26,7 @@ BOUND_WEIGHT = 0.01  # of the term that draws the bounds together
 
 @dataclass(frozen=True)
 class EnsembleState:
-    """State of a batch of B rollouts; the members remember nothing.
+    """State of a batch of B rollouts; the members keep no history.
 
     Attributes:
         observation: (B, S) current observation.

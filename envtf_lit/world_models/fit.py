@@ -11,7 +11,7 @@ from envtf_lit.training import Curves, record_training, run_folder, trained
 from envtf_lit.world_models.lit import LitWorldModel, lit_world_model, window_data
 from envtf_lit.world_models.options import WorldModelOptions
 from envtf_lit.world_models.store import save_world_model
-from envtf_lit.world_models.termination import TERMINATION, learn_termination, save_termination
+from envtf_lit.world_models.termination_head import TERMINATION, learn_termination, save_termination
 
 
 def fit_world_model(

@@ -25,7 +25,7 @@ class ModelOptions:
         epistemic: where epistemic variance comes from: `laplace`, the posterior of the last layer, fitted after
             training; `head`, the paper's third head, trained with the rest; `none`.
         random_features: of the state-action pair, which the posterior of `laplace` sees beside the last hidden token:
-            more detect strange pairs better, and its time grows with their square.
+            more detect out-of-distribution pairs better, and its time grows with their square.
         bounded: predictions stay within the range of the training data, widened by a tenth of it at either end, so that
             no rollout runs away.
     """

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from envtf_lit.modules import load_module, save_module
+from envtf_lit.model_folders import load_module, save_module
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 

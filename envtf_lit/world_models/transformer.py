@@ -217,7 +217,7 @@ class EnvironmentTransformer(nn.Module):
         if observations.shape[1] == 1 or self.options.context == 1:
             return state
         _, tokens = self.encode(observations[:, :-1], actions, cached=True)
-        return state.remember(tokens, window, lengths)
+        return state.with_history(tokens, window, lengths)
 
     def step(
         self,

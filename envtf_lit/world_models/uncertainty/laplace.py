@@ -4,10 +4,10 @@ A score of the outcome sees only the sum of aleatoric and epistemic variance, so
 The last layer, though, is a linear regression on the hidden token, and for that the posterior is known in closed form
 (the Laplace approximation, here exact up to the noise): it is wide where no training token pointed.
 
-A network may map strange inputs onto familiar hidden tokens, since nothing in training asked it to tell them apart. So
-the regression is given random features of the input beside them, which keep apart what differs. Its posterior is as
-wide as an ensemble of linear heads on all of them, with random priors (Osband et al. 2018), would be. Its mean is not
-used: predictions are the trained head's, and draws vary this head's own weights alone.
+A network may map out-of-distribution inputs onto in-distribution hidden tokens, since nothing in training asked it to
+tell them apart. So the regression is given random features of the input beside them, which keep apart what differs. Its
+posterior is as wide as an ensemble of linear heads on all of them, with random priors (Osband et al. 2018), would be.
+Its mean is not used: predictions are the trained head's, and draws vary this head's own weights alone.
 """
 
 from itertools import pairwise

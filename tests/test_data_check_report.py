@@ -11,8 +11,8 @@ from rich.console import Console
 from walker import walker_dataset
 
 from envtf_lit.cli.main import main
+from envtf_lit.data.check_report import inspect_source, quality, render
 from envtf_lit.data.conversion import convert
-from envtf_lit.data.inspection import inspect_source, quality, render
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.data.sources.minari import write_minari
 from envtf_lit.errors import UserError

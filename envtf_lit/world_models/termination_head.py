@@ -1,6 +1,6 @@
 """Learned termination: a classifier of next states, fitted to the log of a robot whose rule is not known.
 
-The robots of the twenty tasks have their rules in `envtf_lit.robots.tasks`; this is for data of one's own.
+The robots of the twenty tasks have their rules in `envtf_lit.robots.termination`; this is for data of one's own.
 """
 
 from collections.abc import Callable
@@ -15,8 +15,9 @@ from torch.nn import functional as F
 from envtf_lit.data.columns import column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import epoch_generator
-from envtf_lit.modules import load_module, save_module
-from envtf_lit.robots.tasks import get_task, never_terminated
+from envtf_lit.model_folders import load_module, save_module
+from envtf_lit.robots.tasks import get_task
+from envtf_lit.robots.termination import never_terminated
 
 HIDDEN, UPDATES, BATCH, LEARNING_RATE = 64, 2_000, 256, 0.003
 

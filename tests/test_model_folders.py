@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from envtf_lit.errors import UserError
 from envtf_lit.files import write_json
-from envtf_lit.modules import load_weights
+from envtf_lit.model_folders import load_weights
 from envtf_lit.policy import TanhGaussianActor, load_policy, save_policy
 from envtf_lit.world_models.options import ModelOptions
 from envtf_lit.world_models.store import load_world_model, save_world_model
