@@ -7,13 +7,15 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from envtf_lit.data.sources.files import load_dataset
+from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.pipeline.yaml import dump_params, load_params, params_yaml, preset_params
 from tests.test_cli import LIGHTNING, exit_status
+from tests.walker import walker_dataset
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +119,14 @@ def test_flags_that_dvc_would_undo_are_said_to_be_so(project: Path, capsys: pyte
     assert said.startswith("params.yaml does not say download.source=file download.path=my.h5: the next `dvc repro`")
     assert exit_status(["source"]) == 0
     assert capsys.readouterr().err == ""
+
+
+def test_a_stage_refuses_another_robots_dataset(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It would train to the end under the wrong rule of falling."""
+    save_dataset(replace(walker_dataset(), task="hopper-medium"), project / "data/dataset.h5")
+    for words in (["train_policy", "bc"], ["generate_rollouts", "transformer"], ["evaluate"]):
+        assert exit_status([*words, "--quiet", "--task=ant-medium"]) == 2
+        assert "was made for hopper-medium, and task is ant-medium" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_file_in_the_home_folder_is_found(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -290,3 +290,25 @@ def test_the_split_of_a_file_survives_the_loss_of_its_last_rows():
     dataset, _ = find(content)
     assert dataset is not None and dataset.held_out is not None
     assert dataset.held_out.tolist() == [False, True]
+
+
+@pytest.mark.parametrize("task", ["halfcheetah-medium", "walker2d-medium"])
+def test_falls_of_another_robot_are_not_taken_for_the_tasks(task: str) -> None:
+    """Walker2d and HalfCheetah have the same dimensions, and not the same rule."""
+    rng = np.random.default_rng(0)
+    heights = rng.uniform(0.5, 1.5, 200).astype(np.float32)  # a walker2d falls below 0.8
+    states = np.zeros((200, 17), np.float32)
+    states[:, 0] = heights
+    log = dict(
+        observations=states,
+        actions=rng.uniform(-1, 1, (200, 6)).astype(np.float32),
+        rewards=np.ones(200, np.float32),
+        next_observations=states,
+        terminated=heights <= np.float32(0.8),
+        truncated=np.zeros(200, bool),
+    )
+    for right in (True, False):
+        made = log if right == (task == "walker2d-medium") else log | {"terminated": np.zeros(200, bool)}
+        dataset, findings = examine(made, {}, task=task)
+        assert dataset is not None
+        assert right == (not [f for f in findings if f.kind == "warning" and "falls by one of them alone" in f.what])

@@ -17,6 +17,13 @@ from envtf_lit.data.statistics import Moments
 from envtf_lit.errors import UserError
 from envtf_lit.robots.tasks import Task, find_task, get_task
 
+CONTRADICTIONS = (
+    0.2  # share of falls that log and robot's rule may see differently: some logs are rounded, or end early
+)
+CONTRADICTIONS = (
+    0.2  # share of falls that log and robot's rule may see differently: some logs are rounded, or end early
+)
+FEWEST_FALLS = 20  # that they must see differently
 RANKS = {
     "observations": 2,
     "actions": 2,
@@ -100,6 +107,8 @@ def examine(
         longer = np.diff(starts, append=len(data["rewards"])) > 1  # the others have no row left
         held_out = None if held_out is None else held_out[longer]
         data, starts = _shift(data, starts, findings)
+    if not _failed(findings) and known is not None:
+        findings += _contradicts_rule(data, known)
     if _failed(findings):
         return None, findings
     dataset = OfflineDataset(
@@ -243,6 +252,17 @@ def _check_robot(data: Mapping[str, Column], task: Task | None, findings: list[F
         fix = "choose the task that the data came from, or null for a robot of your own"
         findings.append(Finding("error", f"{what} {wanted[0]} and {wanted[1]}", fix))
     return found == wanted
+
+
+def _contradicts_rule(data: Mapping[str, Column], task: Task) -> Iterator[Finding]:
+    """Whether the log's terminations are those of another robot: walker2d and halfcheetah have the same dimensions."""
+    columns = data["next_observations"], data["terminated"]
+    fallen = [task.robot.terminated(torch.as_tensor(columns[0][block])).numpy() for block in column_blocks(columns[0])]
+    rule, logged = np.concatenate(fallen), np.asarray(columns[1], bool)
+    wrong, either = int((rule != logged).sum()), int((rule | logged).sum())
+    if wrong > max(CONTRADICTIONS * either, FEWEST_FALLS):
+        what = f"{wrong} of {either} falls, by the log or by {task.robot.name}'s rule, are falls by one of them alone"
+        yield Finding("warning", what, "choose the task that the data came from, or null for a robot of your own")
 
 
 def _held_out(stored: Any, episodes: int, findings: list[Finding]) -> np.ndarray | None:

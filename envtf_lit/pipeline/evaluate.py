@@ -16,9 +16,9 @@ from envtf_lit.figures import gallery
 from envtf_lit.figures.video import no_video, real_vs_imagined
 from envtf_lit.files import replacing, write_json
 from envtf_lit.imagination.store import load_rollouts
+from envtf_lit.pipeline.dataset import dataset_of
 from envtf_lit.pipeline.params import Params, algorithm_of
 from envtf_lit.pipeline.stage import (
-    DATASET,
     METRICS,
     PLOTS,
     POLICIES,
@@ -51,7 +51,7 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         params.download.source,
     )
     with run_stage("evaluate", params, root):
-        dataset, rollouts = load_dataset(root / DATASET), load_rollouts(rollouts_file(root, name))
+        dataset, rollouts = load_dataset(dataset_of(params, root)), load_rollouts(rollouts_file(root, name))
         folder = root / WORLD_MODELS / name
         model = load_world_model(folder)
         training, held_out = dataset.split()

@@ -11,9 +11,9 @@ from envtf_lit.files import check_writable
 from envtf_lit.imagination.histories import BranchPoints
 from envtf_lit.imagination.rollouts import NoisyPolicy, Rollouts, imagine
 from envtf_lit.imagination.store import save_rollouts
+from envtf_lit.pipeline.dataset import dataset_of
 from envtf_lit.pipeline.params import Params, one_of
 from envtf_lit.pipeline.stage import (
-    DATASET,
     POLICIES,
     WORLD_MODELS,
     note_timing,
@@ -63,10 +63,10 @@ def generate_rollouts(
 def _imagine(params: Params, root: Path, name: str) -> Rollouts:
     """The policy's rollouts in the world model; their rate goes to the side file."""
     options, device, folder = params.generate_rollouts, pick_device(), root / WORLD_MODELS / name
+    points = BranchPoints(load_dataset(dataset_of(params, root)), device)
     model = load_world_model(folder, fused=params.compile).to(device)
     policy = load_policy(root / POLICIES / options.policy).to(device)
     generator = torch.Generator(device).manual_seed(params.seed)
-    points = BranchPoints(load_dataset(root / DATASET), device)
     histories = points.draw_stretches(options.branches, options.history, STRETCH, generator)
     check_writable(rollouts_file(root, name), folder=False)  # only now: a refused call leaves no folder
     begin = time.perf_counter()

@@ -11,9 +11,9 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import UPDATES_PER_STEP, return_weights
 from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.store import load_rollouts
+from envtf_lit.pipeline.dataset import dataset_of
 from envtf_lit.pipeline.params import Params, algorithm_of, one_of
 from envtf_lit.pipeline.stage import (
-    DATASET,
     POLICIES,
     WORLD_MODELS,
     rollouts_file,
@@ -47,7 +47,7 @@ def train_policy(
     options, target = params.train_policy[name], root / POLICIES / name
     with run_stage(f"train_policy_{name}", params, root):
         algorithm = ALGORITHMS[algorithm_of(options)]
-        data = transition_data(root / DATASET, options, seed=params.seed, **unseen(params))
+        data = transition_data(dataset_of(params, root), options, seed=params.seed, **unseen(params))
         agent = algorithm(
             data.observation_dim,
             data.action_dim,
@@ -57,7 +57,7 @@ def train_policy(
             seed=params.seed,
             source=imagined_batches(params, root, options, data.dataset) if algorithm.imagines else None,
         )
-        inputs = [root / DATASET]
+        inputs = [dataset_of(params, root)]
         if algorithm.imagines:
             inputs += [root / WORLD_MODELS / options.world_model, rollouts_file(root, options.world_model)]
         settings = run_settings(params, options) | {"algorithm": algorithm_of(options)}

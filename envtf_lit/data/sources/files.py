@@ -100,6 +100,17 @@ def load_dataset(path: str | Path, *, task: str | None = None) -> OfflineDataset
         return build_dataset(raw.columns, raw.attributes, task=task, source=str(path), broken=raw.broken)
 
 
+def stored_task(path: str | Path) -> str | None:
+    """The task that a dataset file says it was made for, without reading its rows.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    with open_raw(path) as raw:
+        name = raw.attributes.get("task")
+    return name.decode(errors="replace") if isinstance(name, bytes) else None if name is None else str(name)
+
+
 @contextmanager
 def open_raw(path: str | Path) -> Iterator[Raw]:
     """Opens a file for reading its columns; they may be used inside the block alone.
