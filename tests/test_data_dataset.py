@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from analytic import linear_data
 
 from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
 from envtf_lit.errors import UserError
@@ -84,3 +85,11 @@ def test_returns_to_go():
     expected = [0 + 0.5 * 1, 1, 2 + 0.5 * (3 + 0.5 * 4), 3 + 0.5 * 4, 4]
     assert dataset.returns_to_go(0.5).tolist() == expected
     assert dataset.returns_to_go(0.0).tolist() == dataset.rewards.tolist()
+
+
+def test_held_out_episodes_are_for_validation_or_for_testing() -> None:
+    data = linear_data((4, 5, 6, 7, 8))
+    validation, test = data.validation_and_test()
+    assert validation.episode_lengths.tolist() == [5, 7] and test.episode_lengths.tolist() == [4, 6, 8]
+    for lone in data.select([3]).validation_and_test():
+        assert lone.episode_lengths.tolist() == [7]

@@ -87,18 +87,20 @@ def test_a_continued_run_equals_an_uninterrupted_one(kind: str, tuned: bool, fol
     assert written() == resumed
 
 
-def test_model_test_equals_validate_and_needs_no_options_beside_the_checkpoint(
+def test_model_test_takes_other_episodes_than_validate_and_no_options_beside_the_checkpoint(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    fit("model")
+    split = "--data.held_out=0.4"
+    fit("model", split)
     (checkpoint,) = Path(".envtf").rglob("*.ckpt")
     numbers = {}
     for verb, prefix in (("validate", "val"), ("test", "test")):
         capsys.readouterr()
-        envtf("model", verb, NO_LOGGER, f"--ckpt_path={checkpoint}")
+        envtf("model", verb, NO_LOGGER, f"--ckpt_path={checkpoint}", split)
         words = capsys.readouterr().out.replace("│", " ").split()
         numbers[verb] = [words[words.index(f"{prefix}/{name}") + 1] for name in ("loss", "open_loop_error")]
-    assert numbers["validate"] == numbers["test"] and float(numbers["test"][0]) > 0
+    assert float(numbers["validate"][0]) > 0 and float(numbers["test"][0]) > 0
+    assert numbers["validate"] != numbers["test"]
 
 
 def test_checkpoints_that_do_not_fit_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,13 +2,11 @@
 
 import pytest
 import torch
-from analytic import linear_data
 from test_transformer import A, S, batch_of, make_model, one_step, sequences
 
 from envtf_lit.world_models.forecast import Trajectories, forecast
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from envtf_lit.world_models.uncertainty.recalibration import (
-    calibration_split,
     fitted_tail,
     normal_scores,
     variance_factor,
@@ -65,16 +63,6 @@ def test_tails_stay_within_bounds():
     tail = fitted_tail(torch.stack([narrow, wide, broken], 1))
     assert tail.tolist() == pytest.approx([MOST, 0.0, 0.0], abs=0.002)
     assert torch.equal(fitted_tail(torch.ones(8, 2)), torch.zeros(2))  # too few
-
-
-def test_every_other_held_out_episode_calibrates():
-    data = linear_data((4, 5, 6, 7, 8))
-    calibration, judged = calibration_split(data)
-    assert calibration is not None
-    assert calibration.episode_lengths.tolist() == [5, 7]
-    assert judged.episode_lengths.tolist() == [4, 6, 8]
-    assert calibration_split(data.select([3]))[0] is None
-    assert calibration_split(data.select([3]))[1].episode_lengths.tolist() == [7]
 
 
 def noisy_episodes(model: EnvironmentTransformer) -> Trajectories:

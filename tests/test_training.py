@@ -237,7 +237,7 @@ def test_run_folders_differ_by_parameters_and_by_bytes(tmp_path):
 def test_the_training_metric_is_what_the_saved_model_scores(root):
     metrics = train_model(TINY, root, progress=False)
     training, held_out = LOG.split()
-    stretches = segments(held_out, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=TINY.seed)
+    stretches = segments(held_out.validation_and_test()[0], SELECTION_SEGMENTS, SELECTION_HORIZON, seed=TINY.seed)
     error = open_loop_error(load_world_model(root / WORLD_MODEL), stretches, Scale.of(training))
     assert error == pytest.approx(metrics["open_loop_error"], rel=1e-5)
 

@@ -37,14 +37,14 @@ def _process(data: L.LightningDataModule) -> tuple[int, int]:
 
 
 class WindowData(L.LightningDataModule):
-    """Windows for world models, with whole episodes held out for validation.
+    """Windows for world models, with whole episodes held out for validation and test.
 
     Args:
         path: dataset file, HDF5 or NPZ.
         context: steps per window; the model's context.
         batch_size: windows per batch and process.
         updates_per_epoch: batches per epoch.
-        held_out: share of the episodes kept for validation, where the dataset does not say which they are.
+        held_out: share of the episodes kept for validation and test, half each, where the dataset does not say which.
         seed: of all draws, and of that split.
         members: of an ensemble, each of which has its own bootstrap resample of the training windows; its batches come
             first in the shape, (members, batch_size, context, …). None gives plain windows.
@@ -52,6 +52,8 @@ class WindowData(L.LightningDataModule):
 
     train: OfflineDataset
     held_out: OfflineDataset
+    validation: OfflineDataset
+    test: OfflineDataset
 
     def __init__(
         self,
@@ -76,6 +78,7 @@ class WindowData(L.LightningDataModule):
     def setup(self, stage: str) -> None:
         """Splits the dataset; called by Lightning."""
         self.train, self.held_out = self.dataset.split(self.share, seed=self.seed)
+        self.validation, self.test = self.held_out.validation_and_test()
 
     def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
         """Batches (B, T, …) of `Windows`, or (M, B, T, …) of `Resamples`."""
@@ -85,13 +88,16 @@ class WindowData(L.LightningDataModule):
         return _loader(windows if self.members is None else Resamples(windows, self.members, seed=self.seed), sampler)
 
     def val_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """Each held-out row once; of several processes, every one sees them all."""
-        windows = Windows(self.held_out, self.context, _device(self))
-        return _loader(windows, windows.tiles().split(256))
+        """Each row once of the episodes for validation; of several processes, every one sees them all."""
+        return self._tiles(self.validation)
 
     def test_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """The same rows as in validation: no third split."""
-        return self.val_dataloader()
+        """The same of the episodes for testing, which neither choose a model nor fit its intervals."""
+        return self._tiles(self.test)
+
+    def _tiles(self, episodes: OfflineDataset) -> DataLoader[dict[str, Tensor]]:
+        windows = Windows(episodes, self.context, _device(self))
+        return _loader(windows, windows.tiles().split(256))
 
     def training_tiles(self, rows: int) -> DataLoader[dict[str, Tensor]]:
         """Each training row once, or some `rows` of them, drawn as whole windows."""

@@ -124,6 +124,14 @@ class OfflineDataset:
         held_out[np.random.default_rng(seed).permutation(count)[:number]] = True
         return replace(self, held_out=held_out)
 
+    def validation_and_test(self) -> tuple["OfflineDataset", "OfflineDataset"]:
+        """Held-out episodes in two: what chooses a model and fits its intervals, and what nothing is chosen by.
+
+        Every other episode goes to either; a lone one is both.
+        """
+        count = len(self.episode_starts)
+        return self.select(range(1 % count, count, 2)), self.select(range(0, count, 2))
+
     def split(self, share: float | None = None, *, seed: int = 0) -> tuple["OfflineDataset", "OfflineDataset"]:
         """By whole episodes into (training, held-out), each without a split of its own.
 

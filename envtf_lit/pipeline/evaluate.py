@@ -34,7 +34,6 @@ from envtf_lit.training import CURVES
 from envtf_lit.world_models.forecast import Scale, whole_episodes
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination_head import termination_source
-from envtf_lit.world_models.uncertainty.recalibration import calibration_split
 
 
 def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -> dict[str, Any]:
@@ -55,7 +54,7 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         folder = root / WORLD_MODELS / name
         model = load_world_model(folder)
         training, held_out = dataset.split()
-        _, held_out = calibration_split(held_out)
+        _, held_out = held_out.validation_and_test()
         scale = Scale.of(training)
         report = horizon_report(model, whole_episodes(held_out, options.trajectories, seed=params.seed), scale)
         policies = {policy: load_policy(root / POLICIES / policy) for policy in params.train_policy}

@@ -34,7 +34,6 @@ from envtf_lit.world_models.fit import fit_world_model
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions, WorldModelOptions
 from envtf_lit.world_models.store import load_world_model
-from envtf_lit.world_models.uncertainty.recalibration import calibration_split
 from envtf_lit.zoo.snapshots import describe_origin
 
 MODELS = ("transformer", "context_1", "ensemble")  # their names in every table, figure and file
@@ -108,7 +107,8 @@ class Suite:
     def split(self) -> tuple[OfflineDataset, OfflineDataset | None, OfflineDataset]:
         """The episodes for training, for calibration (None if there are too few), and for testing, of every model."""
         training, held_out = load_dataset(self.dataset).split()
-        return training, *calibration_split(held_out)
+        calibrating, testing = held_out.validation_and_test()
+        return training, calibrating if len(held_out.episode_starts) > 1 else None, testing
 
 
 def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str, Any]:

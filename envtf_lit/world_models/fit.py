@@ -91,6 +91,6 @@ def publish_world_model(
         save_world_model(folder, lit.best_model)
         if head is not None:
             save_termination(folder / TERMINATION, head)
-            metrics |= head.scores(data.held_out)
+            metrics |= head.scores(data.test)
         record_training(folder, metrics, settings, curves)
     return metrics

@@ -21,7 +21,6 @@ from envtf_lit.world_models.forecast import Scale, open_loop_error, segments, wh
 from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions, WorldModelOptions
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
-from envtf_lit.world_models.uncertainty.recalibration import calibration_split
 
 SELECTION_SEGMENTS, SELECTION_HORIZON = 256, 20  # open-loop stretches by which models are selected
 EPISTEMIC_TOKENS = 100_000  # training rows that epistemic variance is fitted to, at most
@@ -126,7 +125,8 @@ class LitWorldModel(L.LightningModule):
         if self.init_from is not None:
             self._start_from(self.init_from)
         self.scale = Scale.of(data.train, self.device)
-        self.segments = segments(data.held_out, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=self.seed).to(self.device)
+        episodes = data.test if stage == "test" else data.validation
+        self.segments = segments(episodes, SELECTION_SEGMENTS, SELECTION_HORIZON, seed=self.seed).to(self.device)
 
     def _start_from(self, folder: str) -> None:
         try:
@@ -135,15 +135,14 @@ class LitWorldModel(L.LightningModule):
             raise UserError(f"{folder} does not fit the model: {error}") from None
 
     def fit_uncertainty(self, data: WindowData) -> None:
-        """Fits the epistemic variance to training windows, then both variances' scale to half the held-out episodes.
+        """Fits the epistemic variance to training windows, then both variances' scale to the episodes for validation.
 
         Once, at the end, with `data` set up.
         """
         self._fit_epistemic(data)
-        calibration, _ = calibration_split(data.held_out)
-        if calibration is not None:
+        if len(data.held_out.episode_starts) > 1:  # or the one that is tested on would be fitted to
             model = cast(EnvironmentTransformer, self.model)  # the ensemble's module has its own way
-            model.recalibrate(whole_episodes(calibration, CALIBRATION_EPISODES, seed=self.seed))
+            model.recalibrate(whole_episodes(data.validation, CALIBRATION_EPISODES, seed=self.seed))
 
     def _fit_epistemic(self, data: WindowData) -> None:
         batches = data.training_tiles(EPISTEMIC_TOKENS)

@@ -12,23 +12,11 @@ import math
 import torch
 from torch import Tensor
 
-from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.world_models.forecast import Forecast, Trajectories
 from envtf_lit.world_models.uncertainty.tails import ANCHOR, LEAST, LEVEL, MOST, half_width, normal_score, stretch
 
 FEWEST = 9  # residuals that something is fitted to
 FACTORS = 1e-4, 1e4  # least and largest; constant dimensions have no residuals to speak of
-
-
-def calibration_split(held_out: OfflineDataset) -> tuple[OfflineDataset | None, OfflineDataset]:
-    """Held-out episodes that intervals are fitted to, and those they may be judged by: every other one.
-
-    A lone episode is judged by, and nothing is fitted.
-    """
-    count = len(held_out.episode_starts)
-    if count < 2:
-        return None, held_out
-    return held_out.select(range(1, count, 2)), held_out.select(range(0, count, 2))
 
 
 def normal_scores(teacher_forced: Forecast, trajectories: Trajectories) -> Tensor:
