@@ -34,6 +34,15 @@ def mlp(sizes: Sequence[int], *, layer_norm: bool = False) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
+def in_fp32(layer: nn.Module, x: Tensor) -> Tensor:
+    """A last layer's output in fp32, whatever the precision around it.
+
+    bf16 has eight bits: at a value of 300 its steps are 2, wider than what actions differ by.
+    """
+    with torch.autocast(x.device.type, enabled=False):
+        return layer(x.float())
+
+
 class TanhGaussianActor(nn.Module):
     """`a = tanh(x), x ~ N(mean(s), std(s))`, scaled to the action space (Haarnoja et al. 2018, appendix C).
 
@@ -102,8 +111,11 @@ class TanhGaussianActor(nn.Module):
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Observation (..., S) to the mean and log standard deviation, each (..., A), before the tanh."""
-        scaled = (observation - self.observation_mean) / self.observation_std
-        mean, log_std = self.net(scaled).float().chunk(2, dim=-1)
+        x = (observation - self.observation_mean) / self.observation_std
+        *hidden, last = self.net
+        for layer in hidden:
+            x = layer(x)
+        mean, log_std = in_fp32(last, x).chunk(2, dim=-1)
         return mean, log_std.clamp(self.log_std_min, LOG_STD_MAX)
 
     def _scale(self, squashed: Tensor) -> Tensor:

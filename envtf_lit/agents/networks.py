@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from envtf_lit.policy import in_fp32
+
 
 class StackedLinear(nn.Module):
     """n linear layers side by side: (n, B, in) to (n, B, out)."""
@@ -53,7 +55,7 @@ class StackedCritics(nn.Module):
         x = self._activate(x)
         for layer in self.hidden:
             x = self._activate(layer(x))
-        q = self.out(x).float()[..., 0]  # (n, B*N)
+        q = in_fp32(self.out, x)[..., 0]  # (n, B*N)
         return q.view(self.n, B, N) if action.dim() == 3 else q
 
     def _activate(self, x: Tensor) -> Tensor:
@@ -82,4 +84,4 @@ class StateValue(nn.Module):
         for layer in self.hidden:
             x = layer(x)
             x = F.silu(F.layer_norm(x, x.shape[-1:]))
-        return self.out(x).float()[..., 0]
+        return in_fp32(self.out, x)[..., 0]

@@ -40,20 +40,25 @@ class Imagination:
         self.reward_std = float(dataset.rewards.std())
 
     def rollouts(self, policy: Policy, generator: torch.Generator) -> Rollouts:
-        """New branched rollouts under the policy's sampled actions."""
+        """New branched rollouts under the policy's sampled actions, in fp32 whatever the precision around it.
+
+        In bf16 the noise of a hidden token points where no training token did: it would pass for novelty, and for
+        epistemic variance.
+        """
         o = self.options
-        return imagine(
-            self.model,
-            policy,
-            self.starts.draw(o.branches, o.history, generator),
-            horizon=o.horizon,
-            expansion=o.value_expansion,
-            terminated=self.terminated,
-            novelty_limit=o.novelty_limit,
-            mode=o.mode,
-            posterior=o.posterior,
-            generator=generator,
-        )
+        with torch.autocast(self.starts.starts.device.type, enabled=False):
+            return imagine(
+                self.model,
+                policy,
+                self.starts.draw(o.branches, o.history, generator),
+                horizon=o.horizon,
+                expansion=o.value_expansion,
+                terminated=self.terminated,
+                novelty_limit=o.novelty_limit,
+                mode=o.mode,
+                posterior=o.posterior,
+                generator=generator,
+            )
 
 
 class Ring(nn.Module):

@@ -22,7 +22,7 @@ from envtf_lit.pipeline.stage import (
     run_stage,
 )
 from envtf_lit.policy import load_policy
-from envtf_lit.training import autocast, pick_device
+from envtf_lit.training import pick_device
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination import termination_rule
 
@@ -70,15 +70,14 @@ def _imagine(params: Params, root: Path, name: str) -> Rollouts:
     histories = points.draw_stretches(options.branches, options.history, STRETCH, generator)
     check_writable(rollouts_file(root, name), folder=False)  # only now: a refused call leaves no folder
     begin = time.perf_counter()
-    with autocast(device, params.precision):
-        rollouts = imagine(
-            model,
-            NoisyPolicy(policy, options.exploration),
-            histories,
-            horizon=options.horizon,
-            terminated=termination_rule(params.task, folder, device),
-            novelty_limit=options.novelty_limit,
-            generator=generator,
-        )
+    rollouts = imagine(
+        model,
+        NoisyPolicy(policy, options.exploration),
+        histories,
+        horizon=options.horizon,
+        terminated=termination_rule(params.task, folder, device),
+        novelty_limit=options.novelty_limit,
+        generator=generator,
+    )
     note_timing(root, "imagined_transitions_per_second", len(rollouts) / (time.perf_counter() - begin))
     return rollouts
