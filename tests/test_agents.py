@@ -174,6 +174,36 @@ def test_stacked_critics_equal_one_network_per_member():
     torch.testing.assert_close(critics(observation, actions[:, 0]), q[..., 0])
 
 
+# the warm start
+
+
+def equal_rewards(generator: torch.Generator, *, episode: int, terminated: bool) -> dict[str, torch.Tensor]:
+    """Rows of episodes that earn one at each of their steps, of which they have from one to `episode` left.
+
+    Only where they terminate does the state tell how many.
+    """
+    left = torch.randint(1, episode + 1, (64,), generator=generator).float()
+    columns = {name: torch.randn(64, S, generator=generator) for name in ("observations", "last_observations")}
+    if terminated:
+        columns["observations"][:, 0] = left / episode
+    columns |= dict(actions=torch.rand(64, A, generator=generator) * 2 - 1, rewards=torch.ones(64))
+    return columns | dict(returns=(1 - 0.99**left) / 0.01, tails=0.99**left * (not terminated))
+
+
+@pytest.mark.parametrize("terminated", [False, True])
+def test_warm_started_values_see_beyond_truncations_and_not_beyond_terminations(terminated):
+    """A reward of one for ever is worth 1 / (1 - .99) = 100, however soon the log was cut."""
+    agent = make_agent(SAC, updates=1_000, warm_start=0.999, discount=0.99, hidden=(32, 32))
+    agent.return_scale.fill_(100.0)
+    for _ in range(800):
+        agent.update(equal_rewards(agent.generator, episode=200, terminated=terminated))
+        agent.update_index += 1
+    batch = equal_rewards(agent.generator, episode=200, terminated=terminated)
+    q = 100.0 * agent.critics(batch["observations"], batch["actions"])
+    expected = batch["returns"] if terminated else torch.full((64,), 100.0)
+    assert ((q - expected).abs() / 100.0).mean() < 0.02
+
+
 # starting from another policy
 
 

@@ -1,5 +1,6 @@
 """Windows, n-step transitions, and draws that a resumed run repeats."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,24 @@ def test_n_step_transitions_against_hand_computed_sums():
     assert columns["rewards"][[0, 3, 4]].tolist() == [1.0, 3.0, 8.0]
     assert columns["discounts"][[0, 3, 4]].tolist() == [0.0, 0.5, 0.125]
     assert columns["next_observations"][[0, 3, 4], 0].tolist() == [3.0, 4.0, 7.0]
+
+
+def test_what_lies_beyond_a_truncation_counts_by_the_steps_until_there():
+    """Row 3 is an episode of its own, cut after its one step; the others terminate."""
+    transitions = Transitions(make_dataset(), discount=0.5)
+    batch = transitions[torch.arange(9)]
+    assert batch["tails"].tolist() == [0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert batch["last_observations"][:, 0].tolist() == [3.0, 3.0, 3.0, 4.0, 9.0, 9.0, 9.0, 9.0, 9.0]
+    assert batch["returns"][[0, 3, 8]].tolist() == [1.0, 3.0, 8.0]
+    assert transitions.complete_returns()[[0, 8]].tolist() == [1.0, 8.0]  # exact where the task terminated
+
+
+@pytest.mark.parametrize("lengths", [(200,), (7, 90, 30)])
+def test_cut_episodes_of_equal_rewards_are_worth_what_they_would_earn_for_ever(lengths):
+    dataset = replace(make_dataset(lengths, (False,) * len(lengths)), rewards=np.ones(sum(lengths), np.float32))
+    transitions = Transitions(dataset, discount=0.99)
+    assert transitions.typical_return == pytest.approx(100.0, rel=1e-5)
+    torch.testing.assert_close(transitions.complete_returns(), torch.full((len(dataset),), 100.0))
 
 
 def test_draws_depend_on_seed_and_epoch_alone():

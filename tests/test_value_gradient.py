@@ -158,6 +158,8 @@ def log_batch() -> dict[str, Tensor]:
         actions=torch.zeros(len(data), 1),
         rewards=torch.as_tensor(data.rewards),
         returns=torch.as_tensor(data.rewards),
+        tails=torch.zeros(len(data)),
+        last_observations=torch.as_tensor(data.next_observations),
     )
 
 

@@ -21,6 +21,7 @@ from envtf_lit.policy import TanhGaussianActor, load_policy
 
 Batch = dict[str, Tensor]
 Logs = dict[str, Tensor]
+EQUAL = 1e-3  # of a typical return, up to which a spread of returns is rounding, or as good as none
 
 
 @dataclass(frozen=True)
@@ -181,6 +182,10 @@ class Agent(L.LightningModule, ABC):
             loss = self.clone_loss(batch)
             yield "actor", loss, dict(clone_loss=loss)
 
+    def complete_returns(self, batch: Batch) -> Batch:
+        """A real batch whose `returns` count what lies beyond truncations, for values that learn in the warm start."""
+        return batch
+
     def end_warm_start(self) -> None:
         """What follows slowly catches up."""
         self.average_actor.load_state_dict(self.actor.state_dict())
@@ -237,10 +242,13 @@ class Agent(L.LightningModule, ABC):
         self.normalise_with(*data.dataset.observation_scale())
         if self.init_from is not None:
             self._start_from(self.init_from)
-        returns = data.transitions.columns["returns"]
-        self.return_variance = returns.var(correction=0).clamp(min=1e-12).item()
+        returns = data.transitions.complete_returns()
+        self.typical_return, spread = data.transitions.typical_return, float(returns.std(correction=0))
+        if spread <= EQUAL * abs(self.typical_return):  # all are alike: no scale but their size
+            spread = abs(self.typical_return) or 1.0
+        self.return_spread = spread
         if self.options.normalise_returns:
-            self.return_scale.fill_(self.return_variance**0.5)
+            self.return_scale.fill_(spread)
         if self.source is not None:
             self.source.begin(self.return_scale)
 

@@ -17,6 +17,7 @@ from envtf_lit.agents.warm_start import WarmStart
 from envtf_lit.options.numbers import NonNegative
 
 INITIAL_ALPHA = 0.01  # weight of the entropy in the actor's objective at the start; learned from there on
+WARM_TARGET_RATE = 0.05  # share of the critics that enters the target networks at each update of the warm start
 CRITICS = 2  # of which targets and actor take the smallest
 
 
@@ -123,8 +124,20 @@ class SAC(Agent):
         follow(self.target_critics, self.critics, self.options.target_rate)
         super().update_targets()
 
+    @torch.no_grad()
+    def complete_returns(self, batch: Batch) -> Batch:
+        """`G + gamma^n min_i Q_i'(s_T, a'), a' ~ pi(s_T)` for episodes that were cut after n steps, in s_T.
+
+        What terminated keeps its return. The targets Q' follow the critics faster than later on: every other row holds
+        them to what was earned, so that nothing can run away.
+        """
+        follow(self.target_critics, self.critics, WARM_TARGET_RATE)
+        action, _ = self.actor.sample(batch["last_observations"], generator=self.generator)
+        beyond = self.target_critics(batch["last_observations"], action).min(0).values
+        return batch | {"returns": batch["returns"] + batch["tails"] * beyond}
+
     def warm_start_losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
-        """Critics regress on Monte-Carlo returns of the log; the actor clones it."""
+        """Critics regress on Monte-Carlo returns of the log, as `complete_returns` makes them; the actor clones it."""
         q = self.critics(batch["observations"], batch["actions"])
         loss = 0.5 * (q - batch["returns"]).square().mean(1).sum()
         yield "critics", loss, dict(warm_critic_loss=loss, q_data=q.mean())
@@ -136,7 +149,8 @@ class SAC(Agent):
 
     def validation_logs(self, batch: Batch) -> Logs:
         q = self.return_scale * self.critics(batch["observations"], batch["actions"]).min(0).values
-        return dict(q_data=q.mean(), return_error=(q - batch["returns"]).square().mean() / self.return_variance)
+        returns = batch["returns"] + batch["tails"] * self.typical_return
+        return dict(q_data=q.mean(), return_error=((q - returns) / self.return_spread).square().mean())
 
 
 @contextlib.contextmanager

@@ -207,7 +207,13 @@ class Transitions(Dataset[dict[str, Tensor]]):
 
     Columns: `observations`, `actions`, `rewards` (discounted sum over the n steps, or as many as the episode has
     left), `next_observations` (where those steps end), `discounts` (`discount ** steps`, zero if the task terminated
-    there: what the value of `next_observations` counts for), `returns`.
+    there: what the value of `next_observations` counts for); `returns` (discounted sum over all steps that the episode
+    has left), `last_observations` (where it ends) and `tails` (what the value there counts for, likewise: a return that
+    the log cut short is `returns + tails * V(last_observations)`).
+
+    Attributes:
+        typical_return: mean discounted return of the rows, `mean(returns) / (1 - mean(tails))`: that for which
+            truncated episodes go on as rows do on average.
     """
 
     def __init__(
@@ -219,19 +225,24 @@ class Transitions(Dataset[dict[str, Tensor]]):
         rewards = np.zeros(len(dataset))
         for k in range(n_step):
             rewards += np.where(rows + k <= end, discount**k * dataset.rewards[np.minimum(rows + k, last)], 0.0)
-        discounts = discount ** (end - rows + 1.0) * ~dataset.terminated[end]
+        discounts, tails = (discount ** (row - rows + 1.0) * ~dataset.terminated[row] for row in (end, last))
+        returns = dataset.returns_to_go(discount)
+        self.typical_return = float(returns.mean(dtype=np.float64) / (1.0 - tails.mean()))
         self.states = Store(dataset, ("observations", "actions"), device)
         self.following = Store(dataset, ("next_observations",), device)
-        self.columns = dict(
-            rewards=torch.as_tensor(rewards).float().to(device),
-            discounts=torch.as_tensor(discounts).float().to(device),
-            returns=torch.as_tensor(dataset.returns_to_go(discount)).to(device),
-        )
-        self.end = torch.as_tensor(end, device=device)  # (N,) the row in which the n steps of each row end
+        columns = dict(rewards=rewards, discounts=discounts, returns=returns, tails=tails)
+        self.columns = {name: torch.as_tensor(column).float().to(device) for name, column in columns.items()}
+        # (N,) the rows in which the n steps of each row end, and its episode
+        self.end, self.last = torch.as_tensor(end, device=device), torch.as_tensor(last, device=device)
 
     def __len__(self) -> int:
         return len(self.end)
 
     def __getitem__(self, rows: Tensor) -> dict[str, Tensor]:
         rows = rows.to(self.end.device)
-        return self.states[rows] | self.following[self.end[rows]] | {name: c[rows] for name, c in self.columns.items()}
+        found = self.states[rows] | self.following[self.end[rows]] | {name: c[rows] for name, c in self.columns.items()}
+        return found | {"last_observations": self.following[self.last[rows]]["next_observations"]}
+
+    def complete_returns(self) -> Tensor:
+        """(N,) returns to go in which truncated episodes go on at the `typical_return`."""
+        return self.columns["returns"] + self.columns["tails"] * self.typical_return
