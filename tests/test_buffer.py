@@ -100,9 +100,12 @@ def test_steps_of_the_value_expansion_enter_targets_but_not_the_ring():
 def test_new_rollouts_come_every_so_often_from_the_present_policy():
     source = begun(refresh_every=3, branches=4, horizon=1)
     asked, policies = [], [object() for _ in range(8)]
-    source.imagination.rollouts = lambda policy, generator: asked.append((policy, generator)) or made_rollouts([[5.0]])
+    lost = made_rollouts([[5.0, 5.0]], lengths=[1, 0])
+    lost.halted[0, 0] = True
+    source.imagination.rollouts = lambda policy, generator: asked.append((policy, generator)) or lost
     for done, policy in enumerate(policies):
         source.mix(make_batch(), done, policy, seeded())
+        assert (source.cut_share is None) is (done % 3 > 0) and source.cut_share in (None, 0.5)
     assert asked == [(policies[done], GENERATOR) for done in (0, 3, 6)]
     assert held(source, "rewards")[10 % len(source.ring.rewards) :].count(5.0) <= 3
     assert sum(reward == 5.0 for reward in held(source, "rewards")) == 3

@@ -68,9 +68,10 @@ class Losses(Phase):
         self.updates, self.scheduled = updates, scheduled or updates
 
     def update(self, agent: "Agent", batch: Batch, done: int) -> Logs:
+        logs: Logs = {}
         if agent.source is not None:
             batch = agent.source.mix(batch, done, agent.actor, agent.generator)
-        logs: Logs = {}
+            logs |= {} if agent.source.cut_share is None else {"cut_share": agent.source.cut_share}
         for part, loss, found in agent.losses(batch):
             agent.descend(part, loss, rate=agent.rate(part, done / self.scheduled))
             logs |= found
@@ -156,6 +157,8 @@ class Agent(L.LightningModule, ABC):
         self.average_actor = copy.deepcopy(self.actor).requires_grad_(False)
         training.freeze(self.actor, freeze)
         self.phases = self.build_phases()
+        # of the log's rows, in its own rewards, their returns' mean (see `loaders.Transitions`) and standard deviation
+        self.typical_return, self.return_spread = 0.0, 1.0
         self.register_buffer("return_scale", torch.ones(()))  # rewards are divided by it: see `normalise_returns`
         self.register_buffer("started", torch.tensor(False))  # the actor began from another, in a resumed run too
 
@@ -243,7 +246,7 @@ class Agent(L.LightningModule, ABC):
         if self.init_from is not None:
             self._start_from(self.init_from)
         returns = data.transitions.complete_returns()
-        self.typical_return, spread = data.transitions.typical_return, float(returns.std(correction=0))
+        spread, self.typical_return = float(returns.std(correction=0)), data.transitions.typical_return
         if spread <= EQUAL * abs(self.typical_return):  # all are alike: no scale but their size
             spread = abs(self.typical_return) or 1.0
         self.return_spread = spread

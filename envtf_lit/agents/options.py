@@ -22,9 +22,9 @@ class CommonOptions:
         hidden: units of each hidden layer of actor and critics.
         layer_norm: LayerNorm in the critics.
         discount: of future rewards, per step.
-        normalise_returns: divides rewards by the standard deviation of the log's Monte-Carlo returns, in which truncated
-            episodes go on as rows do on average, so that Q has unit spread on any robot and the other weights mean the
-            same everywhere.
+        normalise_returns: divides rewards by the standard deviation of the log's Monte-Carlo returns, truncated
+            episodes going on as rows do on average, so that Q has unit spread on any robot and the other weights mean
+            the same everywhere.
         return_temperature: real rows are drawn with chances exp(episode return / temperature), returns scaled to
             [0, 1], so that a mostly poor log teaches what its best episodes did; null draws uniformly.
         n_step: real steps whose rewards enter the temporal-difference target.

@@ -44,9 +44,10 @@ class RolloutOptions:
         mode: `sample` draws each next state from the model, `mean` takes its mean.
         posterior: above zero each rollout runs in a world model of its own, drawn from the posterior of the last layer
             with its deviation from the mean times this.
-        penalty: weight of the uncertainty u, in units of the data's reward standard deviation: `r - weight * std * u`.
+        penalty: weight of the uncertainty u, in units of the data's reward standard deviation: `r - weight * std * u`;
+            in the value gradient's paths, too.
         novelty_limit: rollouts end where the model's epistemic variance passes this multiple of its 0.999 quantile over
-            the training data; null lets them go on.
+            the training data, and so do the value gradient's paths; null lets them go on.
     """
 
     branches: Count = 1_500
