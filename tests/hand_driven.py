@@ -46,6 +46,7 @@ def make_batch(action_dim: int = A, *, real: int = B) -> Batch:
         discounts=torch.full((B,), 0.99),
         returns=torch.randn(B, generator=generator),
         tails=torch.zeros(B),
+        following_observations=torch.randn(B, S, generator=generator),
         last_observations=torch.randn(B, S, generator=generator),
         real=(torch.arange(B) < real).float(),
     )

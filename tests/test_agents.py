@@ -104,6 +104,21 @@ def test_q_is_pushed_up_on_real_rows_alone_or_as_in_the_paper_on_all(cls, option
         torch.testing.assert_close(gap, torch.full((2,), -up))
 
 
+@pytest.mark.parametrize(("slope", "temperature"), [(0.5, 1.0), (3.0, 1.0), (3.0, 2.0)])
+def test_the_soft_maximum_of_a_slope_is_known(slope, temperature):
+    """Of Q = w a in one dimension, `log integral exp(w a) da = log(2 sinh w / w)`, from each kind of proposals."""
+    agent, batch = hand_driven(CQL, sampled_actions=20_000, cql_temperature=temperature), make_batch(1)
+    nn.init.zeros_(agent.actor.net[-1].weight)
+    nn.init.zeros_(agent.actor.net[-1].bias)  # wide: a standard deviation of one before the tanh
+    actions, density = agent.proposals(batch)
+    w = slope / temperature
+    expected = torch.full((B,), temperature * math.log(2.0 * math.sinh(w) / w))
+    for kind in range(3):
+        rows = slice(20_000 * kind, 20_000 * (kind + 1))
+        found = agent.pushed_down(slope * actions[:, rows, 0], density[:, rows])
+        torch.testing.assert_close(found, expected, atol=0.05, rtol=0)
+
+
 def test_proposals_come_from_the_action_range_with_matching_densities():
     agent = make_agent(sampled_actions=500)
     actions, density = agent.proposals(make_batch(A))
@@ -111,7 +126,7 @@ def test_proposals_come_from_the_action_range_with_matching_densities():
     uniform = actions[:, :500]
     assert uniform.min() < -0.99 and uniform.max() > 0.99 and abs(uniform.mean()) < 0.05
     assert (density[:, :500] == -A * math.log(2.0)).all()
-    for name, first in (("observations", 500), ("next_observations", 1000)):
+    for name, first in (("observations", 500), ("following_observations", 1000)):
         drawn = actions[:, first : first + 500].flatten(0, 1)
         states = make_batch(A)[name].repeat_interleave(500, 0)
         inside = drawn.abs().amax(-1) < 0.99

@@ -65,6 +65,7 @@ def test_n_step_transitions_against_hand_computed_sums():
     assert columns["rewards"][[0, 3, 4]].tolist() == [1.0, 3.0, 8.0]
     assert columns["discounts"][[0, 3, 4]].tolist() == [0.0, 0.5, 0.125]
     assert columns["next_observations"][[0, 3, 4], 0].tolist() == [3.0, 4.0, 7.0]
+    assert columns["following_observations"][:, 0].tolist() == [*range(1, 10)]
 
 
 def test_what_lies_beyond_a_truncation_counts_by_the_steps_until_there():

@@ -207,9 +207,9 @@ class Transitions(Dataset[dict[str, Tensor]]):
 
     Columns: `observations`, `actions`, `rewards` (discounted sum over the n steps, or as many as the episode has
     left), `next_observations` (where those steps end), `discounts` (`discount ** steps`, zero if the task terminated
-    there: what the value of `next_observations` counts for); `returns` (discounted sum over all steps that the episode
-    has left), `last_observations` (where it ends) and `tails` (what the value there counts for, likewise: a return that
-    the log cut short is `returns + tails * V(last_observations)`).
+    there: what the value of `next_observations` counts for), `following_observations` (after one step alone); `returns`
+    (discounted sum over all steps that the episode has left), `last_observations` (where it ends) and `tails` (what the
+    value there counts for, likewise: a return that the log cut short is `returns + tails * V(last_observations)`).
 
     Attributes:
         typical_return: mean discounted return of the rows, `mean(returns) / (1 - mean(tails))`: that for which
@@ -240,8 +240,9 @@ class Transitions(Dataset[dict[str, Tensor]]):
 
     def __getitem__(self, rows: Tensor) -> dict[str, Tensor]:
         rows = rows.to(self.end.device)
-        found = self.states[rows] | self.following[self.end[rows]] | {name: c[rows] for name, c in self.columns.items()}
-        return found | {"last_observations": self.following[self.last[rows]]["next_observations"]}
+        ends = dict(next_observations=self.end[rows], following_observations=rows, last_observations=self.last[rows])
+        following = {name: self.following[row]["next_observations"] for name, row in ends.items()}
+        return self.states[rows] | following | {name: column[rows] for name, column in self.columns.items()}
 
     def complete_returns(self) -> Tensor:
         """(N,) returns to go in which truncated episodes go on at the `typical_return`."""

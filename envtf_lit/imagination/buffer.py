@@ -85,6 +85,7 @@ class Ring(nn.Module):
             actions=(action_dim,),
             rewards=(),
             next_observations=(observation_dim,),
+            following_observations=(observation_dim,),
             discounts=(),
         )
         for name, shape in self.widths.items():
@@ -176,6 +177,7 @@ class ImaginedBatches(nn.Module):
             actions=rollouts.actions,
             rewards=total,
             next_observations=end,
+            following_observations=rollouts.next_observations,
             discounts=weight,
         )
         taken = rollouts.valid.clone()
