@@ -17,12 +17,13 @@ from envtf_lit.agents.cql import CQLOptions
 from envtf_lit.agents.et_cql import ETCQLOptions
 from envtf_lit.agents.value_gradient import ValueGradientOptions
 from envtf_lit.data.sources.files import save_dataset
+from envtf_lit.files import read_json, write_json
 from envtf_lit.imagination.options import GenerateRolloutsOptions, RolloutOptions
 from envtf_lit.modules import load_weights
 from envtf_lit.pipeline.generate_rollouts import generate_rollouts
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.train_model import train_model
-from envtf_lit.pipeline.train_policy import train_policy
+from envtf_lit.pipeline.train_policy import train_policy, within_reach
 from envtf_lit.pipeline.yaml import params_yaml, preset_params
 from envtf_lit.training import run_folder, trained
 from envtf_lit.world_models.forecast import Scale, open_loop_error, segments
@@ -255,6 +256,29 @@ def test_two_processes_with_one_seed_write_the_same_bytes(tmp_path):
 
 
 @pytest.mark.slow
+def test_policies_imagine_no_further_than_the_model_reaches(imagined, capsys):
+    model = imagined / "models/world_model/transformer"
+    reach = read_json(model / "metrics.json")["open_loop_0.1_median"]
+    assert 0 <= reach <= 100
+    wide = replace(ET_CQL, rollouts=RolloutOptions(value_expansion=50), value_gradient=ValueGradientOptions())
+    history = wide.rollouts.history
+    for steps, expansion, horizon in ((7, 6, 7), (1, 0, history), (100, 50, 16)):
+        write_json(model / "metrics.json", read_json(model / "metrics.json") | {"open_loop_0.1_median": steps})
+        cut = within_reach(wide, model)
+        assert list(cut.path_lengths.values()) == [expansion, horizon]
+        note = capsys.readouterr().err
+        assert note.endswith(
+            f"reaches {steps} steps before its error passes 0.1 (open_loop_0.1_median): rollouts.value_expansion is "
+            f"{expansion}, not 50 and value_gradient.horizon is {horizon}, not 16.\n"
+        ) is (steps < 50) and (note == "") is (steps > 50)
+    metrics = {
+        name: value for name, value in read_json(model / "metrics.json").items() if name != "open_loop_0.1_median"
+    }
+    write_json(model / "metrics.json", metrics)  # as earlier versions wrote it
+    assert within_reach(wide, model) == wide
+    write_json(model / "metrics.json", metrics | {"open_loop_0.1_median": reach})
+
+
 def test_the_papers_model_learns_a_step():
     options = preset_params("paper").train_model["transformer"]
     assert isinstance(options, TransformerOptions)

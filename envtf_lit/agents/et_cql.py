@@ -1,8 +1,8 @@
 """The Environment Transformer's policies: conservative Q-learning on the log and on imagined rollouts."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 from torch import Tensor
 
@@ -77,6 +77,19 @@ class ETCQLOptions(ImaginingOptions):
                 f"value_gradient.updates is {gradient.updates}, and {self.updates - self.warm_updates} updates come "
                 "after the warm start: take no more than those."
             )
+
+    @property
+    def path_lengths(self) -> dict[str, int]:
+        lengths, gradient = super().path_lengths, self.value_gradient
+        return lengths if gradient is None else lengths | {"value_gradient.horizon": gradient.horizon}
+
+    def within(self, reach: int) -> Self:
+        """The value gradient's horizon is cut likewise, though not below the history that paths carry on with."""
+        cut, gradient = super().within(reach), self.value_gradient
+        if gradient is None:
+            return cut
+        horizon = min(gradient.horizon, max(reach, self.rollouts.history, 1))
+        return replace(cut, value_gradient=replace(gradient, horizon=horizon))
 
 
 class ETCQL(COMBO):

@@ -37,7 +37,8 @@ class ValueGradientOptions:
     Attributes:
         updates: of all the policy's updates, the last so many; each is one of the actor.
         rollouts: imagined at a time; each is carried on from update to update until the robot falls.
-        horizon: steps of each rollout per update, after which a learned state value stands for what follows.
+        horizon: steps of each rollout per update, after which a learned state value stands for what follows; fewer
+            where the model's held-out reach (`world_models.fit`) is shorter.
         learning_rate: Adam's, of the actor; reached after a tenth of these updates, from there linearly to zero.
         clone_weight: weight in the actor's objective of cloning the real rows' actions.
         actor_average: share of the actor that enters the averaged actor at each of these updates.

@@ -39,7 +39,7 @@ class RolloutOptions:
         horizon: steps of each rollout, unless the robot falls first.
         value_expansion: deterministic steps after the horizon, which are not learned from but whose rewards, and end,
             enter the targets of the steps before them (model-based value expansion, Feinberg et al. 2018); 0 learns
-            from single imagined steps.
+            from single imagined steps; fewer where the model's held-out reach (`world_models.fit`) is shorter.
         history: real steps given to the model before the branch point.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
         posterior: above zero each rollout runs in a world model of its own, drawn from the posterior of the last layer

@@ -3,6 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+
+from envtf_lit.agents.combo import ImaginingOptions
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.agents.store import publish_policy
@@ -22,6 +25,7 @@ from envtf_lit.pipeline.stage import (
     unseen,
 )
 from envtf_lit.training import pick_device, run_folder, trained
+from envtf_lit.world_models.fit import REACH, known_reach
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination import termination_rule
 
@@ -47,6 +51,8 @@ def train_policy(
     options, target = params.train_policy[name], root / POLICIES / name
     with run_stage(f"train_policy_{name}", params, root):
         algorithm = ALGORITHMS[algorithm_of(options)]
+        if isinstance(options, ImaginingOptions):
+            options = within_reach(options, root / WORLD_MODELS / options.world_model)
         data = transition_data(root / DATASET, options, seed=params.seed, **unseen(params))
         agent = algorithm(
             data.observation_dim,
@@ -72,6 +78,23 @@ def train_policy(
             validate=False,
         ) as curves:
             return publish_policy(target, agent.average_actor, curves, curves.rows[-1], settings)
+
+
+def within_reach(options: ImaginingOptions, model: Path) -> ImaginingOptions:
+    """The options with paths no longer than the world model's held-out reach, as its folder says; a note if that cuts.
+
+    Args:
+        options: of a policy that imagines.
+        model: folder of the world model; one of an earlier version says nothing, and nothing is cut.
+    """
+    steps = known_reach(model)
+    if steps is None or (cut := options.within(steps)) == options:
+        return options
+    asked, now = options.path_lengths, cut.path_lengths
+    changes = [f"{name} is {now[name]}, not {length}" for name, length in asked.items() if now[name] != length]
+    note = f"{model} reaches {steps} steps before its error passes 0.1 ({REACH}): {' and '.join(changes)}."
+    Console(stderr=True).print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    return cut
 
 
 def transition_data(dataset: Path, options: PolicyOptions, *, seed: int, held_out: float = 0.0) -> TransitionData:
