@@ -36,13 +36,22 @@ def test_cloning_makes_the_logs_actions_likelier():
     before = agent.actor.log_prob(batch["observations"], batch["actions"]).mean().item()
     losses = [float(agent.update(batch)["clone_loss"].detach()) for _ in range(30)]
     after = agent.actor.log_prob(batch["observations"], batch["actions"]).mean()
-    assert losses[0] == pytest.approx(-before, rel=1e-5) and after > before + 0.5
+    assert losses[0] == pytest.approx(-before / A, rel=1e-5) and after > before + 0.5
 
 
 def test_cloning_knows_real_rows_alone():
     agent, batch = make_agent(BC), make_batch(A, real=3)
     log_density = agent.actor.log_prob(batch["observations"], batch["actions"])
-    torch.testing.assert_close(agent.clone_loss(batch), -log_density[:3].mean())
+    torch.testing.assert_close(agent.clone_loss(batch), -log_density[:3].mean() / A)
+
+
+@pytest.mark.parametrize("joints", [1, 3, 8])
+def test_cloning_weighs_as_much_for_a_robot_of_any_number_of_joints(joints):
+    agent, batch = hand_driven(BC, action_dim=joints), make_batch(joints)
+    nn.init.zeros_(agent.actor.net[-1].weight)
+    nn.init.zeros_(agent.actor.net[-1].bias)
+    batch["actions"] = torch.zeros(B, joints)  # the density of a standard normal's mean
+    torch.testing.assert_close(agent.clone_loss(batch), torch.tensor(0.5 * math.log(2.0 * math.pi)))
 
 
 # soft actor-critic and conservative Q-learning

@@ -233,9 +233,9 @@ class Agent(L.LightningModule, ABC):
         return last.update(self, batch, last.updates - 1)  # asked for more than planned
 
     def clone_loss(self, batch: Batch) -> Tensor:
-        """`-log pi(a|s)`, mean over the real rows."""
+        """`-log pi(a|s) / A`, mean over the real rows; per action dimension, so that it holds every robot alike."""
         log_density = self.actor.log_prob(batch["observations"], batch["actions"])
-        return -(batch["real"] * log_density).sum() / batch["real"].sum()
+        return -(batch["real"] * log_density).sum() / (batch["real"].sum() * self.action_dim)
 
     # Lightning hooks
 

@@ -26,10 +26,11 @@ class SACOptions(PolicyOptions):
     """Soft Actor-Critic's own options.
 
     Attributes:
-        clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log.
+        clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log; of
+            the mean over action dimensions.
     """
 
-    clone_weight: NonNegative = 0.25
+    clone_weight: NonNegative = 0.75
 
 
 class Temperature(nn.Module):

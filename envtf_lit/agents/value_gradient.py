@@ -40,7 +40,7 @@ class ValueGradientOptions:
         horizon: steps of each rollout per update, after which a learned state value stands for what follows; fewer
             where the model's held-out reach (`world_models.fit`) is shorter.
         learning_rate: Adam's, of the actor; reached after a tenth of these updates, from there linearly to zero.
-        clone_weight: weight in the actor's objective of cloning the real rows' actions.
+        clone_weight: weight in the actor's objective of cloning the real rows' actions, mean over action dimensions.
         actor_average: share of the actor that enters the averaged actor at each of these updates.
     """
 
@@ -48,7 +48,7 @@ class ValueGradientOptions:
     rollouts: Count = 64
     horizon: Count = 16
     learning_rate: Positive = 0.001
-    clone_weight: NonNegative = 0.05
+    clone_weight: NonNegative = 0.15
     actor_average: NonzeroShare = rare(0.05)
 
 
