@@ -9,7 +9,14 @@ import torch
 
 from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import DrawSampler, Transitions, Windows, epoch_generator, return_weights
+from envtf_lit.data.loaders import (
+    DrawSampler,
+    Transitions,
+    Windows,
+    effective_episodes,
+    epoch_generator,
+    return_weights,
+)
 from envtf_lit.data.sources.files import save_dataset
 
 
@@ -109,6 +116,35 @@ def test_rows_of_better_episodes_are_drawn_more_often():
     draws = next(iter(DrawSampler(9, (90_000,), 1, seed=0, weights=weights)))
     shares = torch.bincount(draws, minlength=9) / 90_000
     torch.testing.assert_close(shares, (weights / weights.sum()).float(), atol=5e-3, rtol=0)
+
+
+def test_rows_come_from_enough_episodes():
+    """Of a hundred episodes one is far better than all others."""
+    rng = np.random.default_rng(0)
+    dataset = make_dataset(tuple(rng.integers(3, 9, 100)), (True,) * 100)
+    rewards = np.repeat(rng.normal(size=100), dataset.episode_lengths).astype(np.float32)
+    rewards[: dataset.episode_lengths[0]] = 30.0
+    dataset = replace(dataset, rewards=rewards)
+    alone = return_weights(dataset, 0.02)
+    assert effective_episodes(dataset, alone) < 2.0
+    for fewest in (1, 5, 20):
+        held = return_weights(dataset, 0.02, fewest)
+        assert effective_episodes(dataset, held) == pytest.approx(
+            max(fewest, effective_episodes(dataset, alone)), rel=1e-3
+        )
+        assert held.argmax() < dataset.episode_lengths[0]  # still the best one's are likeliest
+    even = effective_episodes(dataset, torch.ones(len(dataset)))
+    assert 80.0 < even < 100.0
+    every = return_weights(dataset, 0.02, 500)
+    assert effective_episodes(dataset, every) == pytest.approx(even, rel=1e-3)
+    torch.testing.assert_close(return_weights(dataset, 5.0, 20), return_weights(dataset, 5.0))  # there were enough
+
+
+def test_effective_episodes_count_by_their_share_of_the_rows():
+    assert effective_episodes(make_dataset((2, 2, 2), (True,) * 3), torch.ones(6)) == pytest.approx(3.0)
+    assert effective_episodes(make_dataset((2, 2), (True,) * 2), torch.tensor([3.0, 3.0, 1.0, 1.0])) == pytest.approx(
+        1.6
+    )
 
 
 def test_processes_share_the_draws_of_one_with_their_batches_together():

@@ -252,6 +252,7 @@ class Agent(L.LightningModule, ABC):
         self.return_spread = spread
         if self.options.normalise_returns:
             self.return_scale.fill_(spread)
+        self.effective_episodes = data.effective_episodes
         if self.source is not None:
             self.source.begin(self.return_scale)
 
@@ -295,7 +296,9 @@ class Agent(L.LightningModule, ABC):
             self.update_index += 1
 
     def on_train_epoch_end(self) -> None:
-        self.log_dict({f"train/{name}": torch.stack(values).mean() for name, values in self.logged.items()})
+        means = {name: torch.stack(values).mean() for name, values in self.logged.items()}
+        logs = means | {"effective_episodes": torch.tensor(self.effective_episodes)}
+        self.log_dict({f"train/{name}": value for name, value in logs.items()})
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
         action = self.average_actor.act(batch["observations"])

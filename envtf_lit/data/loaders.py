@@ -15,6 +15,7 @@ from torch.utils.data import Dataset, Sampler
 from envtf_lit.data.columns import Column, FileRows, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 
+BISECTIONS = 30  # of a temperature
 UPDATES_PER_STEP = 10  # gradient steps of an agent per Lightning training step: no host synchronisation between them
 
 
@@ -91,14 +92,40 @@ class DrawSampler(Sampler[Tensor]):
             yield drawn[..., self.share]
 
 
-def return_weights(dataset: OfflineDataset, temperature: float) -> Tensor:
+def return_weights(dataset: OfflineDataset, temperature: float, fewest_episodes: int = 1) -> Tensor:
     """(N,) `exp(R / temperature)`, R the row's episode return scaled to [0, 1] (Hong et al. 2023).
 
     A log that is mostly poor then teaches what its best episodes did; a small temperature means a sharp preference.
+
+    Args:
+        dataset: whose rows.
+        temperature: raised as far as it must be for rows to come from enough episodes.
+        fewest_episodes: effective number of episodes (`effective_episodes`) that rows come from, or as many as equal
+            chances give.
     """
-    returns = dataset.episode_returns
+    returns, even = dataset.episode_returns, torch.ones(len(dataset))
     scaled = (returns - returns.min()) / (np.ptp(returns) or 1.0)  # 1: all are equal
-    return torch.as_tensor(np.exp((scaled - 1.0) / temperature)[dataset.episode_index])
+
+    def weights(inverse: float) -> Tensor:
+        return torch.as_tensor(np.exp((scaled - 1.0) * inverse)[dataset.episode_index])
+
+    def enough(inverse: float) -> bool:
+        return effective_episodes(dataset, weights(inverse)) >= floor
+
+    floor = min(float(fewest_episodes), effective_episodes(dataset, even))
+    low, high = 0.0, 1.0 / temperature  # of the inverse: equal chances are enough
+    if enough(high):
+        return weights(high)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if enough(middle) else (low, middle)
+    return weights(low)
+
+
+def effective_episodes(dataset: OfflineDataset, weights: Tensor) -> float:
+    """`(sum_e p_e)^2 / sum_e p_e^2`, p_e the chance that a row drawn by weights (N,) is of episode e (Kish 1965)."""
+    chances = np.add.reduceat(weights.double().numpy(), dataset.episode_starts)
+    return float(chances.sum() ** 2 / np.square(chances).sum())
 
 
 class Store:

@@ -10,8 +10,7 @@ from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.agents.store import publish_policy
 from envtf_lit.data.datamodules import TransitionData
-from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import UPDATES_PER_STEP, return_weights
+from envtf_lit.data.loaders import UPDATES_PER_STEP
 from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.params import Params, algorithm_of, one_of
@@ -61,7 +60,7 @@ def train_policy(
             action_low=data.action_low,
             action_high=data.action_high,
             seed=params.seed,
-            source=imagined_batches(params, root, options, data.dataset) if algorithm.imagines else None,
+            source=imagined_batches(params, root, options, data) if algorithm.imagines else None,
         )
         inputs = [root / DATASET]
         if algorithm.imagines:
@@ -113,22 +112,22 @@ def transition_data(dataset: Path, options: PolicyOptions, *, seed: int, held_ou
         discount=options.discount,
         n_step=options.n_step,
         return_temperature=options.return_temperature,
+        fewest_episodes=options.fewest_episodes,
         held_out=held_out,
         seed=seed,
     )
 
 
-def imagined_batches(params: Params, root: Path, options: Any, dataset: OfflineDataset) -> ImaginedBatches:
+def imagined_batches(params: Params, root: Path, options: Any, data: TransitionData) -> ImaginedBatches:
     """The source of imagined rows that a policy's options name."""
     device, folder = pick_device(), root / WORLD_MODELS / options.world_model
-    temperature = options.return_temperature
     imagination = Imagination(
         load_world_model(folder, fused=params.compile).to(device),
-        dataset,
+        data.dataset,
         termination_rule(params.task, folder, device),
         options.rollouts,
         device,
-        weights=None if temperature is None else return_weights(dataset, temperature),  # as the real rows are drawn
+        weights=data.weights,  # as the real rows are drawn
     )
     return ImaginedBatches(
         imagination,
