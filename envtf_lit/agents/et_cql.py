@@ -25,7 +25,7 @@ from envtf_lit.options.numbers import Count, Natural, NonNegative, NonzeroShare,
 
 @dataclass(frozen=True)
 class PaperRolloutOptions(RolloutOptions):
-    """The paper's rollouts: five steps, each learned from, whatever the model knows of its errors."""
+    """The paper's rollouts: five steps, each learned from, whatever the model knows of its errors, at no penalty."""
 
     horizon: Count = 5
     value_expansion: Natural = 0
