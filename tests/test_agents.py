@@ -54,6 +54,48 @@ def test_cloning_weighs_as_much_for_a_robot_of_any_number_of_joints(joints):
     torch.testing.assert_close(agent.clone_loss(batch), torch.tensor(0.5 * math.log(2.0 * math.pi)))
 
 
+def saturated_log(share: float, rows: int, seed: int) -> dict[str, torch.Tensor]:
+    """States and actions, of which such a share, the largest ones, are at their bounds."""
+    generator = torch.Generator().manual_seed(seed)
+    observations = torch.randn(rows, S, generator=generator)
+    drive = observations @ torch.tensor([[1.0, 0.5], [-0.5, 1.0], [0.3, -0.2]])
+    actions = torch.tanh(0.5 * drive + 0.1 * torch.randn(rows, A, generator=generator))
+    large = drive.abs() >= drive.abs().quantile(1.0 - share, dim=0) if share > 0 else torch.zeros_like(drive).bool()
+    return dict(observations=observations, actions=torch.where(large, drive.sign(), actions), real=torch.ones(rows))
+
+
+@pytest.mark.parametrize(("share", "likely"), [(0.0, -2.0), (0.25, -0.6), (1.0, 0.0)])
+def test_clones_of_saturated_logs_learn_actions_and_no_endless_densities(share, likely):
+    """What is at a bound has a probability, of at most one; a density would tell of the clipping alone."""
+    agent, log, held_out = make_agent(BC, hidden=(32, 32)), saturated_log(share, 4_000, 0), saturated_log(share, 500, 1)
+    for _ in range(600):
+        rows = torch.randint(4_000, (64,), generator=agent.generator)
+        loss = agent.clone_loss({name: column[rows] for name, column in log.items()})
+        agent.descend("actor", loss, rate=3e-3)
+    found = float(agent.clone_loss(held_out).detach())
+    assert likely <= found < 0.3
+    assert (agent.actor.act(held_out["observations"]) - held_out["actions"]).square().mean() < 0.06
+    assert all(weight.isfinite().all() for weight in agent.actor.parameters())
+
+
+@pytest.mark.parametrize("mean", [-50.0, 0.0, 3.0, 50.0])
+def test_the_likelihood_at_a_bound_is_a_probability_and_its_gradient_finite(mean):
+    actor = TanhGaussianActor(1, 1, hidden=(4,))
+    nn.init.zeros_(actor.net[-1].weight)  # pyright: ignore[reportArgumentType]
+    nn.init.zeros_(actor.net[-1].bias)  # pyright: ignore[reportArgumentType]
+    with torch.no_grad():
+        actor.net[-1].bias[0] = mean  # pyright: ignore
+    low, high = (actor.log_prob(torch.zeros(1, 1), torch.full((1, 1), bound)) for bound in (-1.0, 1.0))
+    normal = torch.distributions.Normal(0.0, 1.0)
+    edge = torch.atanh(torch.tensor(0.99))
+    assert low <= 0 and high <= 0
+    if abs(mean) < 10:
+        torch.testing.assert_close(high.exp(), normal.cdf(torch.tensor(mean) - edge)[None], rtol=1e-3, atol=1e-6)
+        torch.testing.assert_close(low.exp(), normal.cdf(-edge - mean)[None], rtol=1e-3, atol=1e-6)
+    (low + high).backward()
+    assert all(w.grad is not None and w.grad.isfinite().all() for w in actor.net[-1].parameters())
+
+
 # soft actor-critic and conservative Q-learning
 
 
