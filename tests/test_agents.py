@@ -231,13 +231,22 @@ def test_stacked_critics_equal_one_network_per_member():
     for member in range(2):
         x = torch.cat([(observation - 1.0)[:, None].expand(B, 4, S), actions], -1)
         first = torch.cat([critics.from_observation.weight[member], critics.from_action.weight[member]])
-        x = x @ first + critics.from_observation.bias[member] + critics.from_action.bias[member]
+        assert critics.from_observation.bias is not None and critics.out.bias is not None
+        x = x @ first + critics.from_observation.bias[member]
         x = nn.functional.layer_norm(x, (16,)).relu()
         layer = critics.hidden[0]
         x = nn.functional.layer_norm(x @ layer.weight[member] + layer.bias[member], (8,)).relu()  # pyright: ignore
         x = x @ critics.out.weight[member] + critics.out.bias[member]
         torch.testing.assert_close(q[member], x[..., 0], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(critics(observation, actions[:, 0]), q[..., 0])
+
+
+def test_critics_first_layer_begins_as_a_linear_layer_of_states_and_actions():
+    torch.manual_seed(0)
+    critics, bound = StackedCritics(30, 2, hidden=(400,), layer_norm=False), (30 + 2) ** -0.5
+    for part in (critics.from_observation.weight, critics.from_action.weight, critics.from_observation.bias):
+        assert part is not None and 0.97 * bound < float(part.detach().abs().max()) <= bound
+    assert critics.from_action.bias is None  # one is enough for both
 
 
 # the warm start
