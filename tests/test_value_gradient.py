@@ -23,7 +23,9 @@ from envtf_lit.errors import UserError
 from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.imagination.rollouts import Rollouts
 from envtf_lit.pipeline.params import build_params
+from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.interface import Prediction
+from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.analytic import LinearWorld, linear_data, linear_world
 from tests.hand_driven import EPISODES, flat, hand_driven, imagination, imagined_batches, made_rollouts
 
@@ -179,6 +181,28 @@ def test_guards_hold_the_policy_where_the_model_knows_its_way():
     assert improved(1_000.0, None)[0] < 0.5  # the penalty's gradient points back
     held, cut = improved(0.0, 0.5)  # beyond, no promise counts, and what led there is held back
     assert held < 0.6 and cut > 0.0
+
+
+@pytest.mark.parametrize("kind", ["transformer", "ensemble"])
+def test_a_rollout_stays_in_its_world_until_it_begins_anew(kind, monkeypatch):
+    monkeypatch.setattr(value_gradient, "OLDEST", 9)
+    imagined = imagination(posterior=1.0)
+    torch.manual_seed(0)
+    if kind == "transformer":
+        model: Any = EnvironmentTransformer(3, 1, layers=1, heads=1, width=8, context=4)
+    else:
+        model = EnsembleDynamics(3, 1, members=60, elites=50, hidden=(4, 4))
+    imagined.model = model.requires_grad_(False)
+    paths, generator, worlds = ImaginedPaths(imagined, OPTIONS), torch.Generator().manual_seed(0), []
+    actor: Any = Constant(0.1)
+    for _ in range(4):
+        paths.next(actor, ONE, generator)
+        worlds.append(paths.former.drawn.clone())
+    assert torch.equal(worlds[0], worlds[1]) and torch.equal(worlds[0], worlds[2])
+    assert not torch.equal(worlds[2], worlds[3])  # too old
+    paths.histories = None
+    paths.next(actor, ONE, generator)
+    assert not torch.equal(paths.former.drawn, worlds[3])
 
 
 def begins_at_real_states(paths: Rollouts) -> bool:

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -162,11 +163,13 @@ class ImaginedPaths:
     def __init__(self, imagination: Imagination, options: ValueGradientOptions) -> None:
         self.imagination, self.options = imagination, options
         self.histories: Histories | None = None
+        self.former: Any = None  # the model's state that the paths before began in, whose worlds go on
 
     def next(self, actor: TanhGaussianActor, scale: Tensor, generator: torch.Generator) -> Paths:
         """The next `horizon` steps under the actor's sampled actions, differentiable in the actor.
 
-        Each path runs in a world model of its own, drawn from the posterior as the rollouts' options say. They also say
+        Each rollout runs, from its real state to its end, in a world model of its own, drawn from the posterior as the
+        rollouts' options say. They also say
         what uncertainty costs, and where a path has left what the model knows. No rollout leaves where its robot falls,
         or where it is lost: what comes after means nothing.
 
@@ -179,8 +182,12 @@ class ImaginedPaths:
         if self.histories is None:
             self.histories = self.imagination.starts.draw(self.options.rollouts, o.history, generator)
             self.age = torch.zeros_like(self.histories.lengths)
+            self.former = None
         with torch.no_grad():
             state = self.histories.begin(model, posterior=o.posterior, generator=generator)
+            if self.former is not None:
+                state = model.same_worlds(state, self.former, self.age > 0)
+            self.former = state
 
         def act(t: int, rows: Tensor, observation: Tensor) -> Tensor:
             return actor.sample(observation, generator=generator)[0]

@@ -17,12 +17,14 @@ from envtf_lit.pipeline.stage import (
     POLICIES,
     WORLD_MODELS,
     note_timing,
+    robot_of,
     rollouts_file,
     run_settings,
     run_stage,
 )
 from envtf_lit.policy import load_policy
 from envtf_lit.training import pick_device
+from envtf_lit.world_models.observed import as_observed
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination import termination_rule
 
@@ -63,7 +65,7 @@ def generate_rollouts(
 def _imagine(params: Params, root: Path, name: str) -> Rollouts:
     """The policy's rollouts in the world model; their rate goes to the side file."""
     options, device, folder = params.generate_rollouts, pick_device(), root / WORLD_MODELS / name
-    model = load_world_model(folder, fused=params.compile).to(device)
+    model = as_observed(load_world_model(folder, fused=params.compile).to(device), robot_of(params))
     policy = load_policy(root / POLICIES / options.policy).to(device)
     generator = torch.Generator(device).manual_seed(params.seed)
     points = BranchPoints(load_dataset(root / DATASET), device)

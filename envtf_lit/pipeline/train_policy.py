@@ -18,6 +18,7 @@ from envtf_lit.pipeline.stage import (
     DATASET,
     POLICIES,
     WORLD_MODELS,
+    robot_of,
     rollouts_file,
     run_settings,
     run_stage,
@@ -25,6 +26,7 @@ from envtf_lit.pipeline.stage import (
 )
 from envtf_lit.training import pick_device, run_folder, trained
 from envtf_lit.world_models.fit import REACH, known_reach
+from envtf_lit.world_models.observed import as_observed
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination import termination_rule
 
@@ -122,7 +124,7 @@ def imagined_batches(params: Params, root: Path, options: Any, data: TransitionD
     """The source of imagined rows that a policy's options name."""
     device, folder = pick_device(), root / WORLD_MODELS / options.world_model
     imagination = Imagination(
-        load_world_model(folder, fused=params.compile).to(device),
+        as_observed(load_world_model(folder, fused=params.compile).to(device), robot_of(params)),
         data.dataset,
         termination_rule(params.task, folder, device),
         options.rollouts,
