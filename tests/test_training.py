@@ -17,6 +17,7 @@ from envtf_lit.agents.cql import CQLOptions
 from envtf_lit.agents.et_cql import ETCQLOptions
 from envtf_lit.agents.value_gradient import ValueGradientOptions
 from envtf_lit.data.sources.files import save_dataset
+from envtf_lit.errors import UserError
 from envtf_lit.files import read_json, write_json
 from envtf_lit.imagination.options import GenerateRolloutsOptions, RolloutOptions
 from envtf_lit.modules import load_weights
@@ -253,6 +254,17 @@ def test_two_processes_with_one_seed_write_the_same_bytes(tmp_path):
         written = [p for p in sorted((tmp_path / name).rglob("*")) if p.is_file() and ".envtf" not in p.parts]
         outputs.append({str(p.relative_to(tmp_path / name)): p.read_bytes() for p in written})
     assert len(outputs[0]) > 12 and outputs[0] == outputs[1]
+
+
+def test_a_run_that_diverges_keeps_the_epoch_before(root):
+    """The learning rate comes after the warm start, which is the first epoch."""
+    params = replace(TINY, train_policy={"cql": CQLOptions(**SIZES, critic_learning_rate=1e30)})
+    with pytest.raises(UserError, match=r"^CQL diverged in epoch 2: .*raise cql_weight, or lower critic_learning_rate"):
+        train_policy(params, root, name="cql", progress=False)
+    (run,) = (root / ".envtf/runs").iterdir()
+    saved = torch.load(run / "last.ckpt", weights_only=True)
+    assert saved["epoch"] == 0 and all(value.isfinite().all() for value in saved["state_dict"].values())
+    assert not (root / "models/policy/cql").exists()
 
 
 def test_policies_imagine_no_further_than_the_model_reaches(imagined, capsys):

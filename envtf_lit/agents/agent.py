@@ -2,7 +2,7 @@
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit import training
+from envtf_lit.agents.divergence import check_means
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.loaders import epoch_generator
@@ -89,6 +90,7 @@ class Agent(L.LightningModule, ABC):
         Options: the algorithm's own dataclass of options.
         label: its name in figures and tables.
         imagines: whether it learns from a world model, too.
+        cures: what helps most against divergence, by the logged name; see `divergence.check_means`.
 
     Args:
         observation_dim: S.
@@ -107,6 +109,7 @@ class Agent(L.LightningModule, ABC):
     Options: ClassVar[type[PolicyOptions]]
     label: ClassVar[str]
     imagines: ClassVar[bool] = False
+    cures: ClassVar[Mapping[str, str]] = {"": "lower actor_learning_rate, or look for outliers with `envtf data check`"}
 
     options: PolicyOptions
     return_scale: Tensor
@@ -159,6 +162,7 @@ class Agent(L.LightningModule, ABC):
         self.phases = self.build_phases()
         # of the log's rows, in its own rewards, their returns' mean (see `loaders.Transitions`) and standard deviation
         self.typical_return, self.return_spread = 0.0, 1.0
+        self.largest_return = float("inf")  # likewise, that any policy can have: max |r| / (1 - discount)
         self.register_buffer("return_scale", torch.ones(()))  # rewards are divided by it: see `normalise_returns`
         self.register_buffer("started", torch.tensor(False))  # the actor began from another, in a resumed run too
 
@@ -253,6 +257,7 @@ class Agent(L.LightningModule, ABC):
         if self.options.normalise_returns:
             self.return_scale.fill_(spread)
         self.effective_episodes = data.effective_episodes
+        self.largest_return = float(abs(data.dataset.rewards).max()) / (1.0 - self.options.discount)
         if self.source is not None:
             self.source.begin(self.return_scale)
 
@@ -297,6 +302,8 @@ class Agent(L.LightningModule, ABC):
 
     def on_train_epoch_end(self) -> None:
         means = {name: torch.stack(values).mean() for name, values in self.logged.items()}
+        largest = self.largest_return / float(self.return_scale)
+        check_means(means, largest, self.label, self.current_epoch + 1, self.cures)
         logs = means | {"effective_episodes": torch.tensor(self.effective_episodes)}
         self.log_dict({f"train/{name}": value for name, value in logs.items()})
 

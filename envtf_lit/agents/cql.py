@@ -1,6 +1,7 @@
 """Conservative Q-Learning (Kumar et al. 2020), CQL(H) on soft actor-critic: Q of actions that the log lacks is low."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -38,6 +39,7 @@ class CQL(SAC):
 
     Options: ClassVar[type[PolicyOptions]] = CQLOptions
     label = "CQL"
+    cures: ClassVar[Mapping[str, str]] = {"": "raise cql_weight, or lower critic_learning_rate"}
     options: CQLOptions
 
     def critic_loss(self, batch: Batch) -> tuple[Tensor, Logs]:

@@ -1,6 +1,6 @@
 """The Environment Transformer's policies: conservative Q-learning on the log and on imagined rollouts."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -97,6 +97,9 @@ class ETCQL(COMBO):
 
     Options: ClassVar[type[PolicyOptions]] = ETCQLOptions
     label = "ET + CQL"
+    cures: ClassVar[Mapping[str, str]] = {**COMBO.cures} | dict.fromkeys(
+        ("imagined_value", "value_loss"), "lower value_gradient.learning_rate, or shorten value_gradient.horizon"
+    )
     options: ETCQLOptions
 
     def build_networks(self) -> None:

@@ -3,7 +3,7 @@
 import contextlib
 import copy
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -46,6 +46,9 @@ class SAC(Agent):
 
     Options: ClassVar[type[PolicyOptions]] = SACOptions
     label = "SAC"
+    cures: ClassVar[Mapping[str, str]] = {
+        "": "lower critic_learning_rate, or warm up for longer with a larger warm_start"
+    }
     options: SACOptions
 
     def build_networks(self) -> None:

@@ -40,10 +40,17 @@ class ClippedWorld:
         return self.model.action_dim
 
     def init(
-        self, observations: Tensor, actions: Tensor, lengths: Tensor, *window: Tensor | None, **options: Any
+        self,
+        observations: Tensor,
+        actions: Tensor,
+        lengths: Tensor,
+        window: Tensor | None = None,
+        *,
+        posterior: float = 0.0,
+        generator: torch.Generator | None = None,
     ) -> Any:
         """See `WorldModel.init`."""
-        return self.model.init(observations, actions, lengths, *window, **options)
+        return self.model.init(observations, actions, lengths, window, posterior=posterior, generator=generator)
 
     def step(
         self, state: Any, action: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None
