@@ -14,6 +14,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.model_folders import load_module, save_module
 
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
+BOUND = 0.99  # squashed actions of at least this size count as at their bound
 
 
 class Policy(Protocol):
@@ -32,6 +33,15 @@ def mlp(sizes: Sequence[int], *, layer_norm: bool = False) -> nn.Sequential:
         if index < len(sizes) - 2:
             layers += [nn.LayerNorm(fan_out), nn.ReLU()] if layer_norm else [nn.ReLU()]
     return nn.Sequential(*layers)
+
+
+def in_fp32(layer: nn.Module, x: Tensor) -> Tensor:
+    """A last layer's output in fp32, whatever the precision around it.
+
+    bf16 has eight bits: at a value of 300 its steps are 2, wider than what actions differ by.
+    """
+    with torch.autocast(x.device.type, enabled=False):
+        return layer(x.float())
 
 
 class TanhGaussianActor(nn.Module):
@@ -102,8 +112,11 @@ class TanhGaussianActor(nn.Module):
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Observation (..., S) to the mean and log standard deviation, each (..., A), before the tanh."""
-        scaled = (observation - self.observation_mean) / self.observation_std
-        mean, log_std = self.net(scaled).float().chunk(2, dim=-1)
+        x = (observation - self.observation_mean) / self.observation_std
+        *hidden, last = self.net
+        for layer in hidden:
+            x = layer(x)
+        mean, log_std = in_fp32(last, x).chunk(2, dim=-1)
         return mean, log_std.clamp(self.log_std_min, LOG_STD_MAX)
 
     def _scale(self, squashed: Tensor) -> Tensor:
@@ -138,13 +151,18 @@ class TanhGaussianActor(nn.Module):
         return self._scale(torch.tanh(raw)), log_density.sum(-1)
 
     def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Log-density of given actions: observation (B, S), action (B, A) to (B,), per unit of the squashed action."""
+        """Log-likelihood of given actions: observation (B, S), action (B, A) to (B,).
+
+        Log-density per unit of the squashed action; at the bound, where that has no limit, the log-probability of all
+        that is squashed beyond it (a censored Gaussian: Tobin 1958), at most zero.
+        """
         mean, log_std = self(observation)
         squashed = 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0
-        raw = torch.atanh(squashed.clamp(-0.999, 0.999))
+        raw = torch.atanh(squashed.clamp(-BOUND, BOUND))
         scaled = (raw - mean) * torch.exp(-log_std)
-        log_density = -0.5 * scaled.square() - log_std - 0.5 * math.log(2 * math.pi) - _log_tanh_slope(raw)
-        return log_density.sum(-1)
+        inside = -0.5 * scaled.square() - log_std - 0.5 * math.log(2 * math.pi) - _log_tanh_slope(raw)
+        beyond = torch.special.log_ndtr(-scaled * squashed.sign())
+        return torch.where(squashed.abs() < BOUND, inside, beyond).sum(-1)
 
 
 def _normal(like: Tensor, generator: torch.Generator | None) -> Tensor:

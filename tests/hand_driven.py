@@ -45,6 +45,9 @@ def make_batch(action_dim: int = A, *, real: int = B) -> Batch:
         next_observations=torch.randn(B, S, generator=generator),
         discounts=torch.full((B,), 0.99),
         returns=torch.randn(B, generator=generator),
+        tails=torch.zeros(B),
+        following_observations=torch.randn(B, S, generator=generator),
+        last_observations=torch.randn(B, S, generator=generator),
         real=(torch.arange(B) < real).float(),
     )
 

@@ -37,6 +37,7 @@ def test_ring_keeps_the_newest():
         actions=torch.zeros(n, A),
         rewards=torch.arange(start, start + n).float(),
         next_observations=torch.zeros(n, S),
+        following_observations=torch.zeros(n, S),
         discounts=torch.zeros(n),
     )
     ring.add(column(0, 3))
@@ -53,7 +54,7 @@ def test_mixing_keeps_the_real_ratio(ratio, kept):
     source, batch = begun(real_ratio=ratio), make_batch()
     mixed = source.mix(batch, 0, None, seeded())
     assert mixed["real"].tolist() == [1.0] * kept + [0.0] * (B - kept)
-    for name in ("observations", "actions", "rewards", "next_observations", "discounts"):
+    for name in ("observations", "actions", "rewards", "next_observations", "following_observations", "discounts"):
         assert len(mixed[name]) == B and torch.equal(mixed[name][:kept], batch[name][:kept])
     assert mixed["rewards"][kept:].tolist() == [1.0] * (B - kept)
     assert mixed["discounts"][kept:].tolist() == pytest.approx([0.99] * (B - kept))
@@ -93,6 +94,7 @@ def test_steps_of_the_value_expansion_enter_targets_but_not_the_ring():
     source.add_rollouts(rollouts, horizon=1)
     assert held(source, "observations") == [0.0, 10.0, 20.0]
     assert held(source, "next_observations") == [3.0, 12.0, 22.0]
+    assert held(source, "following_observations") == [1.0, 11.0, 21.0]
     assert held(source, "rewards") == [1.0 + 1.0 + 1.0, 1.0 + 1.0, 1.0 + 1.0]
     assert held(source, "discounts") == [0.125, 0.25, 0.0]
 
@@ -100,9 +102,12 @@ def test_steps_of_the_value_expansion_enter_targets_but_not_the_ring():
 def test_new_rollouts_come_every_so_often_from_the_present_policy():
     source = begun(refresh_every=3, branches=4, horizon=1)
     asked, policies = [], [object() for _ in range(8)]
-    source.imagination.rollouts = lambda policy, generator: asked.append((policy, generator)) or made_rollouts([[5.0]])
+    lost = made_rollouts([[5.0, 5.0]], lengths=[1, 0])
+    lost.halted[0, 0] = True
+    source.imagination.rollouts = lambda policy, generator: asked.append((policy, generator)) or lost
     for done, policy in enumerate(policies):
         source.mix(make_batch(), done, policy, seeded())
+        assert (source.cut_share is None) is (done % 3 > 0) and source.cut_share in (None, 0.5)
     assert asked == [(policies[done], GENERATOR) for done in (0, 3, 6)]
     assert held(source, "rewards")[10 % len(source.ring.rewards) :].count(5.0) <= 3
     assert sum(reward == 5.0 for reward in held(source, "rewards")) == 3

@@ -102,7 +102,7 @@ def test_papers_preset_has_the_published_settings() -> None:
     own: Any = policy
     assert (own.updates, own.hidden, own.sampled_actions) == (1_000_000, (256, 256, 256), 10)
     assert (own.world_model, own.real_ratio, own.refresh_every) == ("transformer", 0.5, 0)
-    assert (own.rollouts.horizon, own.rollouts.penalty, own.rollouts.value_expansion) == (5, 1.0, 0)
+    assert (own.rollouts.horizon, own.rollouts.penalty, own.rollouts.value_expansion) == (5, 0.0, 0)
     assert not hasattr(own, "value_gradient")
 
 

@@ -11,6 +11,8 @@ from envtf_lit.imagination.histories import BranchPoints, Histories
 from envtf_lit.imagination.rollouts import NoisyPolicy, Rollouts, imagine
 from envtf_lit.imagination.store import load_rollouts, save_rollouts
 from envtf_lit.policy import TanhGaussianActor
+from envtf_lit.robots.tasks import get_task
+from envtf_lit.world_models.observed import as_observed
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.analytic import LinearWorld, linear_data, linear_world
 from tests.hand_driven import made_rollouts
@@ -206,6 +208,22 @@ def test_a_halted_rollout_leaves():
     assert torch.equal(rollouts.halted, rollouts.valid & (rollouts.next_observations[..., 0] > 0.5))
     assert torch.equal(rollouts.valid[1:], rollouts.valid[:-1] & ~rollouts.halted[:-1])
     assert 0 < rollouts.halted.sum() < 30
+
+
+@pytest.mark.parametrize("task", ["hopper-medium", "walker2d-medium", "halfcheetah-medium"])
+def test_imagined_velocities_stay_where_the_simulator_shows_them(task):
+    robot = get_task(task).robot
+    S = robot.observation_dim
+    growing = LinearWorld(3.0 * torch.eye(S), torch.zeros(S, robot.action_dim), observation_dim=S)
+    world, state = as_observed(growing, robot), torch.full((2, S), 2.0)
+    state[1] = -2.0
+    for size in (6.0, 18.0, 54.0):
+        state, prediction = world.step(state, torch.zeros(2, robot.action_dim))
+        assert torch.equal(world.current(state), prediction.observation)
+        shown = torch.full((S,), size)
+        shown[robot.clipped_from if robot.clipped_from is not None else S :] = min(size, 10.0)
+        assert torch.equal(prediction.observation, torch.stack([shown, -shown]))
+    assert as_observed(growing, None) is growing and (world is growing) is (task == "halfcheetah-medium")
 
 
 def test_noise_respects_the_action_range():

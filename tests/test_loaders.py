@@ -1,5 +1,6 @@
 """Windows, n-step transitions, and draws that a resumed run repeats."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,14 @@ import torch
 
 from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import DrawSampler, Transitions, Windows, epoch_generator, return_weights
+from envtf_lit.data.loaders import (
+    DrawSampler,
+    Transitions,
+    Windows,
+    effective_episodes,
+    epoch_generator,
+    return_weights,
+)
 from envtf_lit.data.sources.files import save_dataset
 
 
@@ -64,6 +72,25 @@ def test_n_step_transitions_against_hand_computed_sums():
     assert columns["rewards"][[0, 3, 4]].tolist() == [1.0, 3.0, 8.0]
     assert columns["discounts"][[0, 3, 4]].tolist() == [0.0, 0.5, 0.125]
     assert columns["next_observations"][[0, 3, 4], 0].tolist() == [3.0, 4.0, 7.0]
+    assert columns["following_observations"][:, 0].tolist() == [*range(1, 10)]
+
+
+def test_what_lies_beyond_a_truncation_counts_by_the_steps_until_there():
+    """Row 3 is an episode of its own, cut after its one step; the others terminate."""
+    transitions = Transitions(make_dataset(), discount=0.5)
+    batch = transitions[torch.arange(9)]
+    assert batch["tails"].tolist() == [0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert batch["last_observations"][:, 0].tolist() == [3.0, 3.0, 3.0, 4.0, 9.0, 9.0, 9.0, 9.0, 9.0]
+    assert batch["returns"][[0, 3, 8]].tolist() == [1.0, 3.0, 8.0]
+    assert transitions.complete_returns()[[0, 8]].tolist() == [1.0, 8.0]  # exact where the task terminated
+
+
+@pytest.mark.parametrize("lengths", [(200,), (7, 90, 30)])
+def test_cut_episodes_of_equal_rewards_are_worth_what_they_would_earn_for_ever(lengths):
+    dataset = replace(make_dataset(lengths, (False,) * len(lengths)), rewards=np.ones(sum(lengths), np.float32))
+    transitions = Transitions(dataset, discount=0.99)
+    assert transitions.typical_return == pytest.approx(100.0, rel=1e-5)
+    torch.testing.assert_close(transitions.complete_returns(), torch.full((len(dataset),), 100.0))
 
 
 def test_draws_depend_on_seed_and_epoch_alone():
@@ -89,6 +116,35 @@ def test_rows_of_better_episodes_are_drawn_more_often():
     draws = next(iter(DrawSampler(9, (90_000,), 1, seed=0, weights=weights)))
     shares = torch.bincount(draws, minlength=9) / 90_000
     torch.testing.assert_close(shares, (weights / weights.sum()).float(), atol=5e-3, rtol=0)
+
+
+def test_rows_come_from_enough_episodes():
+    """Of a hundred episodes one is far better than all others."""
+    rng = np.random.default_rng(0)
+    dataset = make_dataset(tuple(rng.integers(3, 9, 100)), (True,) * 100)
+    rewards = np.repeat(rng.normal(size=100), dataset.episode_lengths).astype(np.float32)
+    rewards[: dataset.episode_lengths[0]] = 30.0
+    dataset = replace(dataset, rewards=rewards)
+    alone = return_weights(dataset, 0.02)
+    assert effective_episodes(dataset, alone) < 2.0
+    for fewest in (1, 5, 20):
+        held = return_weights(dataset, 0.02, fewest)
+        assert effective_episodes(dataset, held) == pytest.approx(
+            max(fewest, effective_episodes(dataset, alone)), rel=1e-3
+        )
+        assert held.argmax() < dataset.episode_lengths[0]  # still the best one's are likeliest
+    even = effective_episodes(dataset, torch.ones(len(dataset)))
+    assert 80.0 < even < 100.0
+    every = return_weights(dataset, 0.02, 500)
+    assert effective_episodes(dataset, every) == pytest.approx(even, rel=1e-3)
+    torch.testing.assert_close(return_weights(dataset, 5.0, 20), return_weights(dataset, 5.0))  # there were enough
+
+
+def test_effective_episodes_count_by_their_share_of_the_rows():
+    assert effective_episodes(make_dataset((2, 2, 2), (True,) * 3), torch.ones(6)) == pytest.approx(3.0)
+    assert effective_episodes(make_dataset((2, 2), (True,) * 2), torch.tensor([3.0, 3.0, 1.0, 1.0])) == pytest.approx(
+        1.6
+    )
 
 
 def test_processes_share_the_draws_of_one_with_their_batches_together():

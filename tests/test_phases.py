@@ -176,3 +176,35 @@ def test_imagined_rows_enter_the_losses_alone():
         agent.update(make_batch())
         agent.update_index += 1
     assert mixed == [(done, agent.actor, agent.generator) for done in range(2)]
+
+
+# divergence
+
+
+def after_an_epoch(agent: Any, **means: float) -> None:
+    agent.effective_episodes, agent.logged = 5.0, {name: [torch.tensor(value)] for name, value in means.items()}
+    agent.log_dict = lambda *_: None
+    agent.on_train_epoch_end()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["clone_loss", "q_data"])
+def test_what_is_not_finite_stops_a_run(name, value):
+    with pytest.raises(UserError, match=f"CQL diverged in epoch 1: {name} is {value}, .* raise cql_weight, or lower"):
+        after_an_epoch(hand_driven(CQL), **{"q_target": 1.0, name: value})
+
+
+@pytest.mark.parametrize("name", ["q_data", "q_target", "q_policy"])
+def test_values_beyond_what_rewards_allow_stop_a_run(name):
+    agent = hand_driven(SAC)
+    agent.largest_return = 3.0 / (1.0 - 0.99)  # rewards of at most three
+    agent.return_scale.fill_(100.0)
+    after_an_epoch(agent, **{name: 6.9})  # twice that, and what a network says that has learned nothing
+    after_an_epoch(agent, **{name: -1e6}, conservative_gap=1e6)
+    with pytest.raises(UserError, match=rf"{name} is 7\.1, where rewards allow 3 .* lower critic_learning_rate"):
+        after_an_epoch(agent, **{name: 7.1})
+
+
+def test_the_value_gradient_has_cures_of_its_own():
+    with pytest.raises(UserError, match=r"imagined_value is nan.* lower value_gradient\.learning_rate, or shorten"):
+        after_an_epoch(et_cql(2, 3), imagined_value=float("nan"))

@@ -63,6 +63,25 @@ def test_rules_agree_with_the_simulator_wherever_the_robot_is_put(name: str) -> 
     assert (name == "halfcheetah") == (not any(fell)) and not all(fell)
 
 
+@pytest.mark.parametrize(
+    ("task", "survives"), [("hopper-medium", 0.0), ("hopper-medium-v4", 1.0), ("ant-medium", None)]
+)
+def test_rewards_differ_between_versions_as_the_docs_say(task: str, survives: float | None) -> None:
+    """Of a fall's own step, and of the contacts that our Ant doesn't observe."""
+    env, rng, costs = get_task(task).robot.make(), np.random.default_rng(0), []
+    env.reset(seed=0)
+    for _ in range(200):
+        _, reward, terminated, _, info = env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+        costs.append(-info.get("reward_contact", 0.0))
+        if terminated and survives is not None:
+            break
+    if survives is None:
+        assert 0.0 < max(costs) <= 78 * 5e-4
+    else:
+        shaped = info["x_velocity"] + survives
+        assert terminated and float(reward) == pytest.approx(shaped, abs=3.1e-3)  # and at most that for control
+
+
 def test_a_coordinate_below_minus_a_hundred_ends_hoppers_episode() -> None:
     upright = torch.tensor([1.25, *(10 * [0.0])])
     for value, fell in ((99.0, False), (-99.0, False), (101.0, True), (-101.0, True)):

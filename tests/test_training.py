@@ -17,12 +17,14 @@ from envtf_lit.agents.cql import CQLOptions
 from envtf_lit.agents.et_cql import ETCQLOptions
 from envtf_lit.agents.value_gradient import ValueGradientOptions
 from envtf_lit.data.sources.files import save_dataset
+from envtf_lit.errors import UserError
+from envtf_lit.files import read_json, write_json
 from envtf_lit.imagination.options import GenerateRolloutsOptions, RolloutOptions
 from envtf_lit.model_folders import load_weights
 from envtf_lit.pipeline.generate_rollouts import generate_rollouts
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.train_model import train_model
-from envtf_lit.pipeline.train_policy import train_policy
+from envtf_lit.pipeline.train_policy import train_policy, within_reach
 from envtf_lit.pipeline.yaml import params_yaml, preset_params
 from envtf_lit.training import run_folder, trained
 from envtf_lit.world_models.forecast import Scale, open_loop_error, segments
@@ -252,6 +254,40 @@ def test_two_processes_with_one_seed_write_the_same_bytes(tmp_path):
         written = [p for p in sorted((tmp_path / name).rglob("*")) if p.is_file() and ".envtf" not in p.parts]
         outputs.append({str(p.relative_to(tmp_path / name)): p.read_bytes() for p in written})
     assert len(outputs[0]) > 12 and outputs[0] == outputs[1]
+
+
+def test_a_run_that_diverges_keeps_the_epoch_before(root):
+    """The learning rate comes after the warm start, which is the first epoch."""
+    params = replace(TINY, train_policy={"cql": CQLOptions(**SIZES, critic_learning_rate=1e30)})
+    with pytest.raises(UserError, match=r"^CQL diverged in epoch 2: .*raise cql_weight, or lower critic_learning_rate"):
+        train_policy(params, root, name="cql", progress=False)
+    (run,) = (root / ".envtf/runs").iterdir()
+    saved = torch.load(run / "last.ckpt", weights_only=True)
+    assert saved["epoch"] == 0 and all(value.isfinite().all() for value in saved["state_dict"].values())
+    assert not (root / "models/policy/cql").exists()
+
+
+def test_policies_imagine_no_further_than_the_model_reaches(imagined, capsys):
+    model = imagined / "models/world_model/transformer"
+    reach = read_json(model / "metrics.json")["open_loop_0.1_median"]
+    assert 0 <= reach <= 100
+    wide = replace(ET_CQL, rollouts=RolloutOptions(value_expansion=50), value_gradient=ValueGradientOptions(updates=5))
+    history = wide.rollouts.history
+    for steps, expansion, horizon in ((7, 6, 7), (1, 0, history), (100, 50, 16)):
+        write_json(model / "metrics.json", read_json(model / "metrics.json") | {"open_loop_0.1_median": steps})
+        cut = within_reach(wide, model)
+        assert list(cut.path_lengths.values()) == [expansion, horizon]
+        note = capsys.readouterr().err
+        assert note.endswith(
+            f"reaches {steps} steps before its error passes 0.1 (open_loop_0.1_median): rollouts.value_expansion is "
+            f"{expansion}, not 50 and value_gradient.horizon is {horizon}, not 16.\n"
+        ) is (steps < 50) and (note == "") is (steps > 50)
+    metrics = {
+        name: value for name, value in read_json(model / "metrics.json").items() if name != "open_loop_0.1_median"
+    }
+    write_json(model / "metrics.json", metrics)  # as earlier versions wrote it
+    assert within_reach(wide, model) == wide
+    write_json(model / "metrics.json", metrics | {"open_loop_0.1_median": reach})
 
 
 @pytest.mark.slow

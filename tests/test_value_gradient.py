@@ -1,7 +1,7 @@
 """The gradient of imagined returns: paths, their value by hand, and an actor that improves in a world known exactly."""
 
 import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -10,16 +10,28 @@ from torch import Tensor, nn
 
 from envtf_lit.agents import value_gradient
 from envtf_lit.agents.et_cql import ETCQL
-from envtf_lit.agents.value_gradient import BETAS, ImaginedPaths, StateValues, ValueGradient, ValueGradientOptions
+from envtf_lit.agents.value_gradient import (
+    BETAS,
+    ImaginedPaths,
+    Paths,
+    Returns,
+    StateValues,
+    ValueGradient,
+    ValueGradientOptions,
+)
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.imagination.rollouts import Rollouts
 from envtf_lit.pipeline.params import build_params
-from tests.analytic import linear_data
+from envtf_lit.world_models.ensemble import EnsembleDynamics
+from envtf_lit.world_models.interface import Prediction
+from envtf_lit.world_models.transformer import EnvironmentTransformer
+from tests.analytic import LinearWorld, linear_data, linear_world
 from tests.hand_driven import EPISODES, flat, hand_driven, imagination, imagined_batches, made_rollouts
 
 OPTIONS = ValueGradientOptions(updates=4, rollouts=6, horizon=3)
 ONE = torch.ones(())
+NONE = Returns(0.0, 1.0)
 
 
 class Constant(nn.Module):
@@ -42,22 +54,37 @@ def make_values(value: float) -> StateValues:
     return values
 
 
-def hand_made(last_reward: float = 3.0) -> Rollouts:
+def hand_made(last_reward: float = 3.0) -> Paths:
     """Two rollouts of three steps, neither of which leaves; the second falls at its second step."""
     paths = made_rollouts([[1.0, 1.0], [2.0, 2.0], [3.0, last_reward]])
     paths.terminated[1, 1] = True
-    return paths
+    return Paths(**vars(paths), excess=torch.zeros(3, 2))
 
 
 def test_a_paths_return_ends_with_the_fall_and_else_with_the_states_value():
-    returns = make_values(10.0).imagined_return(hand_made(), discount=0.5)
+    returns = make_values(10.0).imagined_return(hand_made(), 0.5, NONE)
     torch.testing.assert_close(returns, torch.tensor([1.0 + 1.0 + 0.75 + 0.125 * 10.0, 1.0 + 1.0]))
+
+
+@pytest.mark.parametrize(("mean", "worth"), [(4.0, 4.0 - 2.0 * 0.3), (12.0, 10.0 - 2.0 * 0.3)])
+def test_where_the_model_is_lost_a_path_ends_at_no_more_than_a_typical_return(mean, worth):
+    """The prediction itself counts for nothing, whatever it promises; the other path falls at the same step."""
+    paths, log = hand_made(), Returns(mean, 2.0)
+    paths.rewards[1, 0], paths.halted[1, 0], paths.excess[1, 0] = 1e6, True, 0.3
+    paths.halted[2], paths.excess[2] = True, 9.0  # after both have ended
+    returns = make_values(10.0).imagined_return(paths, 0.5, log)
+    torch.testing.assert_close(returns, torch.tensor([1.0 + 0.5 * worth, 1.0 + 1.0]))
+    targets = make_values(10.0).value_targets(paths, 0.5, log)
+    first = 1.0 + 0.5 * (0.05 * 10.0 + 0.95 * worth)
+    torch.testing.assert_close(targets[:2, 0], torch.tensor([first, worth]))
+    states = torch.cat([s for s, _ in make_values(0.0).value_batches(paths, 0.5, log, torch.Generator())])
+    assert set(states[:, 0].tolist()) == {0.0, 1.0, 10.0, 11.0}
 
 
 @pytest.mark.parametrize("trace", [0.0, 0.5, 1.0])
 def test_value_targets_are_td_lambda(trace, monkeypatch):
     monkeypatch.setattr(value_gradient, "TRACE", trace)
-    targets = make_values(10.0).value_targets(hand_made(), discount=0.5)
+    targets = make_values(10.0).value_targets(hand_made(), 0.5, NONE)
     last = 3.0 + 0.5 * 10.0
     middle = 2.0 + 0.5 * ((1 - trace) * 10.0 + trace * last)
     first = 1.0 + 0.5 * ((1 - trace) * 10.0 + trace * middle)
@@ -67,7 +94,7 @@ def test_value_targets_are_td_lambda(trace, monkeypatch):
 
 def test_the_value_learns_nothing_from_steps_after_a_fall(monkeypatch):
     monkeypatch.setattr(value_gradient, "PASSES", 3)
-    batches = list(make_values(10.0).value_batches(hand_made(1e6), 0.5, torch.Generator().manual_seed(0)))
+    batches = list(make_values(10.0).value_batches(hand_made(1e6), 0.5, NONE, torch.Generator().manual_seed(0)))
     assert sum(len(states) for states, _ in batches) == 3 * 5
     assert max(float(targets.max()) for _, targets in batches) < 100.0
 
@@ -75,10 +102,10 @@ def test_the_value_learns_nothing_from_steps_after_a_fall(monkeypatch):
 def test_every_pass_pairs_each_state_with_its_target(monkeypatch):
     monkeypatch.setattr(value_gradient, "BATCH", 2)
     values, paths = make_values(10.0), hand_made()
-    targets = values.value_targets(paths, 0.5)
+    targets = values.value_targets(paths, 0.5, NONE)
     expected = {(float(paths.observations[t, b, 0]), float(targets[t, b])) for t in range(3) for b in range(2)}
     expected.discard((12.0, float(targets[2, 1])))  # after the fall
-    batches = list(values.value_batches(paths, 0.5, torch.Generator().manual_seed(0)))
+    batches = list(values.value_batches(paths, 0.5, NONE, torch.Generator().manual_seed(0)))
     assert {len(states) for states, _ in batches} == {1, 2}
     pairs = [(float(s[0]), float(g)) for states, goals in batches for s, g in zip(states, goals, strict=True)]
     assert set(pairs) == expected and len(pairs) == value_gradient.PASSES * 5
@@ -88,7 +115,7 @@ def test_the_gradient_through_the_world_equals_finite_differences():
     def value(level: float) -> tuple[Tensor, Constant]:
         actor: Any = Constant(level)
         paths = ImaginedPaths(imagination(), OPTIONS).next(actor, ONE, torch.Generator().manual_seed(0))
-        return make_values(2.0).imagined_return(paths, 0.9).mean(), actor
+        return make_values(2.0).imagined_return(paths, 0.9, NONE).mean(), actor
 
     middle, actor = value(0.3)
     middle.backward()
@@ -115,6 +142,69 @@ def test_rollouts_go_on_where_they_stood_until_they_are_old(monkeypatch):
     assert not torch.isclose(third.observations[0], second.next_observations[-1]).all(-1).any()
 
 
+def test_uncertainty_costs_a_path_what_it_costs_a_rollout():
+    def rewards(penalty: float) -> Tensor:
+        actor: Any = Constant(0.1)
+        imagined = imagination(penalty=penalty)
+        imagined.reward_std = 3.0
+        return ImaginedPaths(imagined, OPTIONS).next(actor, torch.tensor(2.0), torch.Generator().manual_seed(0)).rewards
+
+    torch.testing.assert_close(rewards(0.0) - rewards(4.0), torch.full((3, 6), 4.0 * 3.0 * 0.1 / 2.0))
+
+
+@dataclass
+class Known(LinearWorld):
+    """Knows actions up to a half; what it is unsure of, it says, and rewards lie beyond."""
+
+    def step(self, state: Tensor, action: Tensor, **options: Any) -> tuple[Tensor, Prediction]:
+        following, found = super().step(state, action, **options)
+        unsure = (action[:, 0].abs() - 0.5).clamp(min=0.0)
+        reward = found.reward + 100.0 * action[:, 0]
+        return following, replace(found, reward=reward, uncertainty=found.uncertainty + unsure, novelty=0.5 + unsure)
+
+
+def improved(penalty: float, limit: float | None) -> tuple[float, float]:
+    """The mean action, and the share of paths that are cut, after some updates in a world that promises riches."""
+    agent, batch = make_agent(penalty=penalty, novelty_limit=limit), log_batch()
+    agent.source.imagination.model = Known(**vars(linear_world()))
+    agent.source.imagination.reward_std = 1.0
+    agent.return_spread = 58.0 / (1.0 - 0.9**2) ** 0.5  # of such rewards, where a log's actions are uniform
+    for _ in range(40):
+        found = agent.update(batch)
+        agent.update_index += 1
+    return float(agent.average_actor.act(batch["observations"]).mean()), float(found["cut_share"])
+
+
+def test_guards_hold_the_policy_where_the_model_knows_its_way():
+    free, uncut = improved(0.0, None)
+    assert free > 0.6 and uncut == 0.0
+    assert improved(1_000.0, None)[0] < 0.5  # the penalty's gradient points back
+    held, cut = improved(0.0, 0.5)  # beyond, no promise counts, and what led there is held back
+    assert held < 0.6 and cut > 0.0
+
+
+@pytest.mark.parametrize("kind", ["transformer", "ensemble"])
+def test_a_rollout_stays_in_its_world_until_it_begins_anew(kind, monkeypatch):
+    monkeypatch.setattr(value_gradient, "OLDEST", 9)
+    imagined = imagination(posterior=1.0)
+    torch.manual_seed(0)
+    if kind == "transformer":
+        model: Any = EnvironmentTransformer(3, 1, layers=1, heads=1, width=8, context=4)
+    else:
+        model = EnsembleDynamics(3, 1, members=60, elites=50, hidden=(4, 4))
+    imagined.model = model.requires_grad_(False)
+    paths, generator, worlds = ImaginedPaths(imagined, OPTIONS), torch.Generator().manual_seed(0), []
+    actor: Any = Constant(0.1)
+    for _ in range(4):
+        paths.next(actor, ONE, generator)
+        worlds.append(paths.former.drawn.clone())
+    assert torch.equal(worlds[0], worlds[1]) and torch.equal(worlds[0], worlds[2])
+    assert not torch.equal(worlds[2], worlds[3])  # too old
+    paths.histories = None
+    paths.next(actor, ONE, generator)
+    assert not torch.equal(paths.former.drawn, worlds[3])
+
+
 def begins_at_real_states(paths: Rollouts) -> bool:
     real = torch.as_tensor(linear_data(EPISODES).observations)
     return bool((torch.cdist(paths.observations[0].detach(), real).min(1).values < 1e-3).all())
@@ -126,7 +216,18 @@ def test_the_fallen_begin_anew_at_real_states():
     for _ in range(2):
         found = paths.next(actor, ONE, generator)
         assert found.terminated.all() and found.valid.all()  # no rollout leaves
-        assert value_gradient.standing(found)[1:].sum() == 0
+        assert not value_gradient.standing(found)[0][1:].any()
+        assert begins_at_real_states(found)
+
+
+def test_the_lost_begin_anew_at_real_states():
+    lost = imagination(novelty_limit=1.0)
+    lost.model = linear_world(novelty=torch.full((6,), 2.0))
+    paths, generator = ImaginedPaths(lost, OPTIONS), torch.Generator().manual_seed(0)
+    actor: Any = Constant(0.1)
+    for _ in range(2):
+        found = paths.next(actor, ONE, generator)
+        assert found.halted.all() and not value_gradient.standing(found)[1].any()
         assert begins_at_real_states(found)
 
 
@@ -145,10 +246,11 @@ def test_the_learning_rate_rises_over_a_tenth_and_falls_to_zero():
     assert [phase.rate(x) for x in progress] == pytest.approx([0.0, 0.45, 0.9, 0.45, 0.0])
 
 
-def make_agent() -> Any:
+def make_agent(**rollouts: Any) -> Any:
     options = replace(OPTIONS, updates=60, learning_rate=0.01)
-    plain = RolloutOptions(history=2, mode="mean", posterior=0.0, novelty_limit=None)
-    return hand_driven(ETCQL, source=imagined_batches(), discount=0.9, rollouts=plain, value_gradient=options)
+    plain = RolloutOptions(history=2)
+    source = imagined_batches(**rollouts)
+    return hand_driven(ETCQL, source=source, discount=0.9, rollouts=plain, value_gradient=options)
 
 
 def log_batch() -> dict[str, Tensor]:
@@ -158,6 +260,8 @@ def log_batch() -> dict[str, Tensor]:
         actions=torch.zeros(len(data), 1),
         rewards=torch.as_tensor(data.rewards),
         returns=torch.as_tensor(data.rewards),
+        tails=torch.zeros(len(data)),
+        last_observations=torch.as_tensor(data.next_observations),
     )
 
 

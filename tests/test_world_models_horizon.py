@@ -6,8 +6,17 @@ import torch
 from analytic import linear_data, linear_world
 
 from envtf_lit.errors import UserError
-from envtf_lit.evaluation.horizon import error_quartiles, horizon_report, steps_within
-from envtf_lit.world_models.forecast import Scale, forecast, nmse, open_loop_error, segments, whole_episodes
+from envtf_lit.evaluation.horizon import error_quartiles, horizon_report
+from envtf_lit.world_models.forecast import (
+    Scale,
+    forecast,
+    median_steps_within,
+    nmse,
+    open_loop_error,
+    segments,
+    steps_within,
+    whole_episodes,
+)
 
 
 def test_a_perfect_model_is_censored_everywhere():
@@ -162,3 +171,22 @@ def test_later_trajectories_begin_where_they_are_told_to():
         np.testing.assert_array_equal(later.targets[row, : later.lengths[row], :-1], data.next_observations[rows])
         np.testing.assert_array_equal(later.actions[row, : later.lengths[row]], data.actions[rows])
     assert torch.equal(whole.later(0).observations, whole.observations)
+
+
+@pytest.mark.parametrize(
+    ("bad", "lengths", "expected"),
+    [
+        ([1, 2, 3, 4], [9, 9, 9, 9], 3),  # half of them stay for three steps
+        ([5, 5, None, None], [9, 9, 2, 2], 5),  # the short ones say nothing of what follows
+        ([5, 7, 8, None], [9, 9, 9, 9], 8),
+        ([0, 0, 0, 4], [9, 9, 9, 9], 0),
+        ([None, None, None, 3], [9, 9, 9, 9], 9),
+    ],
+)
+def test_the_median_reach_takes_ends_for_unknown(bad, lengths, expected):
+    """Trajectories whose errors pass the threshold after so many steps, or never."""
+    error = torch.zeros(4, 9)
+    for row, steps in enumerate(bad):
+        if steps is not None:
+            error[row, steps:] = 1.0
+    assert median_steps_within(error, torch.tensor(lengths), 0.1) == expected

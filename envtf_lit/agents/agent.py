@@ -2,7 +2,7 @@
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit import training
+from envtf_lit.agents.divergence import check_means
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.loaders import epoch_generator
@@ -21,6 +22,7 @@ from envtf_lit.policy import TanhGaussianActor, load_policy
 
 Batch = dict[str, Tensor]
 Logs = dict[str, Tensor]
+EQUAL = 1e-3  # of a typical return, up to which a spread of returns is rounding, or as good as none
 
 
 @dataclass(frozen=True)
@@ -67,9 +69,10 @@ class Losses(Phase):
         self.updates, self.scheduled = updates, scheduled or updates
 
     def update(self, agent: "Agent", batch: Batch, done: int) -> Logs:
+        logs: Logs = {}
         if agent.source is not None:
             batch = agent.source.mix(batch, done, agent.actor, agent.generator)
-        logs: Logs = {}
+            logs |= {} if agent.source.cut_share is None else {"cut_share": agent.source.cut_share}
         for part, loss, found in agent.losses(batch):
             agent.descend(part, loss, rate=agent.rate(part, done / self.scheduled))
             logs |= found
@@ -87,6 +90,7 @@ class Agent(L.LightningModule, ABC):
         Options: the algorithm's own dataclass of options.
         label: its name in figures and tables.
         imagines: whether it learns from a world model, too.
+        cures: what helps most against divergence, by the logged name; see `divergence.check_means`.
 
     Args:
         observation_dim: S.
@@ -105,6 +109,7 @@ class Agent(L.LightningModule, ABC):
     Options: ClassVar[type[PolicyOptions]]
     label: ClassVar[str]
     imagines: ClassVar[bool] = False
+    cures: ClassVar[Mapping[str, str]] = {"": "lower actor_learning_rate, or look for outliers with `envtf data check`"}
 
     options: PolicyOptions
     return_scale: Tensor
@@ -155,6 +160,9 @@ class Agent(L.LightningModule, ABC):
         self.average_actor = copy.deepcopy(self.actor).requires_grad_(False)
         training.freeze(self.actor, freeze)
         self.phases = self.build_phases()
+        # of the log's rows, in its own rewards, their returns' mean (see `loaders.Transitions`) and standard deviation
+        self.typical_return, self.return_spread = 0.0, 1.0
+        self.largest_return = float("inf")  # likewise, that any policy can have: max |r| / (1 - discount)
         self.register_buffer("return_scale", torch.ones(()))  # rewards are divided by it: see `normalise_returns`
         self.register_buffer("started", torch.tensor(False))  # the actor began from another, in a resumed run too
 
@@ -180,6 +188,10 @@ class Agent(L.LightningModule, ABC):
         if self.clones:
             loss = self.clone_loss(batch)
             yield "actor", loss, dict(clone_loss=loss)
+
+    def complete_returns(self, batch: Batch) -> Batch:
+        """A real batch whose `returns` count what lies beyond truncations, for values that learn in the warm start."""
+        return batch
 
     def end_warm_start(self) -> None:
         """What follows slowly catches up."""
@@ -225,9 +237,9 @@ class Agent(L.LightningModule, ABC):
         return last.update(self, batch, last.updates - 1)  # asked for more than planned
 
     def clone_loss(self, batch: Batch) -> Tensor:
-        """`-log pi(a|s)`, mean over the real rows."""
+        """`-log pi(a|s) / A`, mean over the real rows; per action dimension, so that it holds every robot alike."""
         log_density = self.actor.log_prob(batch["observations"], batch["actions"])
-        return -(batch["real"] * log_density).sum() / batch["real"].sum()
+        return -(batch["real"] * log_density).sum() / (batch["real"].sum() * self.action_dim)
 
     # Lightning hooks
 
@@ -237,10 +249,15 @@ class Agent(L.LightningModule, ABC):
         self.normalise_with(*data.dataset.observation_scale())
         if self.init_from is not None:
             self._start_from(self.init_from)
-        returns = data.transitions.columns["returns"]
-        self.return_variance = returns.var(correction=0).clamp(min=1e-12).item()
+        returns = data.transitions.complete_returns()
+        spread, self.typical_return = float(returns.std(correction=0)), data.transitions.typical_return
+        if spread <= EQUAL * abs(self.typical_return):  # all are alike: no scale but their size
+            spread = abs(self.typical_return) or 1.0
+        self.return_spread = spread
         if self.options.normalise_returns:
-            self.return_scale.fill_(self.return_variance**0.5)
+            self.return_scale.fill_(spread)
+        self.effective_episodes = data.effective_episodes
+        self.largest_return = float(abs(data.dataset.rewards).max()) / (1.0 - self.options.discount)
         if self.source is not None:
             self.source.begin(self.return_scale)
 
@@ -284,7 +301,11 @@ class Agent(L.LightningModule, ABC):
             self.update_index += 1
 
     def on_train_epoch_end(self) -> None:
-        self.log_dict({f"train/{name}": torch.stack(values).mean() for name, values in self.logged.items()})
+        means = {name: torch.stack(values).mean() for name, values in self.logged.items()}
+        largest = self.largest_return / float(self.return_scale)
+        check_means(means, largest, self.label, self.current_epoch + 1, self.cures)
+        logs = means | {"effective_episodes": torch.tensor(self.effective_episodes)}
+        self.log_dict({f"train/{name}": value for name, value in logs.items()})
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
         action = self.average_actor.act(batch["observations"])

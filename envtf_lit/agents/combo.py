@@ -1,7 +1,7 @@
 """COMBO's conservative term (Yu et al. 2021): down on real and imagined rows alike, up on real rows alone."""
 
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 from torch import Tensor
 
@@ -27,6 +27,20 @@ class ImaginingOptions(CQLOptions):
     real_ratio: NonzeroShare = 0.75
     refresh_every: Natural = 250
     rollouts: RolloutOptions = field(default_factory=RolloutOptions)
+
+    @property
+    def path_lengths(self) -> dict[str, int]:
+        """Steps through the world model, by option."""
+        return {"rollouts.value_expansion": self.rollouts.value_expansion}
+
+    def within(self, reach: int) -> Self:
+        """The same, with no path through the world model longer than `reach` steps, as far as that can be.
+
+        Rollouts keep their horizon, which is what is learned from; their value expansion is cut.
+        """
+        o = self.rollouts
+        expansion = max(0, min(o.value_expansion, reach - o.horizon))
+        return replace(self, rollouts=replace(o, value_expansion=expansion))
 
 
 class COMBO(CQL):

@@ -1,6 +1,7 @@
 """Conservative Q-Learning (Kumar et al. 2020), CQL(H) on soft actor-critic: Q of actions that the log lacks is low."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -10,7 +11,7 @@ from torch import Tensor
 from envtf_lit.agents.agent import Batch, Logs
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.sac import SAC, SACOptions
-from envtf_lit.options.numbers import Count, NonNegative
+from envtf_lit.options.numbers import Count, NonNegative, Positive
 from envtf_lit.options.schema import rare
 
 
@@ -19,11 +20,17 @@ class CQLOptions(SACOptions):
     """Conservative Q-Learning's own options.
 
     Attributes:
-        cql_weight: weight of the conservative term.
+        cql_weight: weight of the conservative term. In units of Q as the critics learn it, which `normalise_returns`
+            divides by the return scale (the spread of the log's returns): a published weight of w on plain rewards is
+            w / scale.
+        cql_temperature: of the log-sum-exp, in the same units, so that 1 is one spread of the log's returns: actions
+            that differ by far less count alike, and the term pushes their mean down. Published is 1 in plain rewards:
+            1 / scale here, with which little but the best of the proposals counts.
         sampled_actions: actions of each kind (uniform, pi(s), pi(s')) in the log-sum-exp.
     """
 
     cql_weight: NonNegative = 0.1
+    cql_temperature: Positive = rare(1.0)
     sampled_actions: Count = rare(2)
 
 
@@ -32,6 +39,7 @@ class CQL(SAC):
 
     Options: ClassVar[type[PolicyOptions]] = CQLOptions
     label = "CQL"
+    cures: ClassVar[Mapping[str, str]] = {"": "raise cql_weight, or lower critic_learning_rate"}
     options: CQLOptions
 
     def critic_loss(self, batch: Batch) -> tuple[Tensor, Logs]:
@@ -57,18 +65,23 @@ class CQL(SAC):
         return batch["rewards"] + batch["discounts"] * following
 
     def proposals(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Actions (B, 3N, A) for the log-sum-exp, uniform, from pi(s) and from pi(s'), with log-density (B, 3N)."""
+        """Actions (B, 3N, A) for the log-sum-exp, uniform, from pi(s) and from pi(s'), with log-density (B, 3N).
+
+        s' is the state one step later, whose actions are plausible in s, too; not where n-step transitions end.
+        """
         B, A, N = len(batch["rewards"]), self.action_dim, self.options.sampled_actions
         low, high = self.actor.action_low, self.actor.action_high
         uniform = low + (high - low) * torch.rand(B, N, A, generator=self.generator, device=low.device)
         now, now_density = self.actor.sample(batch["observations"], N, generator=self.generator)
-        later, later_density = self.actor.sample(batch["next_observations"], N, generator=self.generator)
+        later, later_density = self.actor.sample(batch["following_observations"], N, generator=self.generator)
         uniform_density = torch.full((B, N), -A * math.log(2.0), device=low.device)  # on the squashed range [-1, 1]
         return torch.cat([uniform, now, later], 1), torch.cat([uniform_density, now_density, later_density], 1)
 
     def pushed_down(self, q_proposed: Tensor, log_density: Tensor) -> Tensor:
-        """(n, B) `log mean exp(Q(s, a_j) - log p_j)`: the soft maximum of Q, by importance sampling."""
-        return torch.logsumexp(q_proposed - log_density, dim=-1) - math.log(q_proposed.shape[-1])
+        """(n, B) `T log mean exp(Q(s, a_j) / T - log p_j)`: the soft maximum of Q, `T log integral exp(Q(s, a) / T) da`
+        over the squashed range, by importance sampling."""
+        T = self.options.cql_temperature
+        return T * (torch.logsumexp(q_proposed / T - log_density, dim=-1) - math.log(q_proposed.shape[-1]))
 
     def conservative_gap(self, q_data: Tensor, q_proposed: Tensor, log_density: Tensor, real: Tensor) -> Tensor:
         """(n,) what CQL pushes down less what it pushes up, both over all rows: on a mixture, equation 5 as written."""

@@ -1,8 +1,8 @@
 """The Environment Transformer's policies: conservative Q-learning on the log and on imagined rollouts."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import ClassVar
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 from torch import Tensor
 
@@ -25,7 +25,7 @@ from envtf_lit.options.numbers import Count, Natural, NonNegative, NonzeroShare,
 
 @dataclass(frozen=True)
 class PaperRolloutOptions(RolloutOptions):
-    """The paper's rollouts: five steps, each learned from, whatever the model knows of its errors."""
+    """The paper's rollouts: five steps, each learned from, whatever the model knows of its errors, at no penalty."""
 
     horizon: Count = 5
     value_expansion: Natural = 0
@@ -78,12 +78,28 @@ class ETCQLOptions(ImaginingOptions):
                 "after the warm start: take no more than those."
             )
 
+    @property
+    def path_lengths(self) -> dict[str, int]:
+        lengths, gradient = super().path_lengths, self.value_gradient
+        return lengths if gradient is None else lengths | {"value_gradient.horizon": gradient.horizon}
+
+    def within(self, reach: int) -> Self:
+        """The value gradient's horizon is cut likewise, though not below the history that paths carry on with."""
+        cut, gradient = super().within(reach), self.value_gradient
+        if gradient is None:
+            return cut
+        horizon = min(gradient.horizon, max(reach, self.rollouts.history, 1))
+        return replace(cut, value_gradient=replace(gradient, horizon=horizon))
+
 
 class ETCQL(COMBO):
     """CQL in COMBO's form on data and fresh imagination, then the actor follows the gradient of imagined returns."""
 
     Options: ClassVar[type[PolicyOptions]] = ETCQLOptions
     label = "ET + CQL"
+    cures: ClassVar[Mapping[str, str]] = {**COMBO.cures} | dict.fromkeys(
+        ("imagined_value", "value_loss"), "lower value_gradient.learning_rate, or shorten value_gradient.horizon"
+    )
     options: ETCQLOptions
 
     def build_networks(self) -> None:

@@ -8,18 +8,28 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from envtf_lit.policy import in_fp32
+
 
 class StackedLinear(nn.Module):
-    """n linear layers side by side: (n, B, in) to (n, B, out)."""
+    """n linear layers side by side: (n, B, in) to (n, B, out).
 
-    def __init__(self, n: int, fan_in: int, fan_out: int) -> None:
+    Args:
+        n: how many.
+        fan_in, fan_out: sizes.
+        beside: further inputs, whose part of the sum another layer computes; they count in the initialisation, which is
+            torch.nn.Linear's of both together.
+        bias: whether there is one; of layers that are summed, in one.
+    """
+
+    def __init__(self, n: int, fan_in: int, fan_out: int, *, beside: int = 0, bias: bool = True) -> None:
         super().__init__()
-        bound = 1.0 / math.sqrt(fan_in)  # torch.nn.Linear's own initialisation
+        bound = 1.0 / math.sqrt(fan_in + beside)
         self.weight = nn.Parameter(torch.empty(n, fan_in, fan_out).uniform_(-bound, bound))
-        self.bias = nn.Parameter(torch.empty(n, 1, fan_out).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(n, 1, fan_out).uniform_(-bound, bound)) if bias else None
 
     def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
+        return torch.bmm(x, self.weight) if self.bias is None else torch.baddbmm(self.bias, x, self.weight)
 
 
 class StackedCritics(nn.Module):
@@ -35,8 +45,8 @@ class StackedCritics(nn.Module):
         self, observation_dim: int, action_dim: int, *, n: int = 2, hidden: Sequence[int], layer_norm: bool
     ) -> None:
         super().__init__()
-        self.from_observation = StackedLinear(n, observation_dim, hidden[0])
-        self.from_action = StackedLinear(n, action_dim, hidden[0])
+        self.from_observation = StackedLinear(n, observation_dim, hidden[0], beside=action_dim)
+        self.from_action = StackedLinear(n, action_dim, hidden[0], beside=observation_dim, bias=False)
         self.hidden = nn.ModuleList(StackedLinear(n, a, b) for a, b in pairwise(hidden))
         self.out = StackedLinear(n, hidden[-1], 1)
         self.n, self.layer_norm = n, layer_norm
@@ -53,11 +63,11 @@ class StackedCritics(nn.Module):
         x = self._activate(x)
         for layer in self.hidden:
             x = self._activate(layer(x))
-        q = self.out(x).float()[..., 0]  # (n, B*N)
+        q = in_fp32(self.out, x)[..., 0]  # (n, B*N)
         return q.view(self.n, B, N) if action.dim() == 3 else q
 
     def _activate(self, x: Tensor) -> Tensor:
-        if self.layer_norm:  # without gain and shift, which the next layer can express
+        if self.layer_norm:  # without gain and shift: a rectifier follows, so no later layer could make up for a shift
             x = F.layer_norm(x, x.shape[-1:])
         return F.relu(x)
 
@@ -82,4 +92,4 @@ class StateValue(nn.Module):
         for layer in self.hidden:
             x = layer(x)
             x = F.silu(F.layer_norm(x, x.shape[-1:]))
-        return self.out(x).float()[..., 0]
+        return in_fp32(self.out, x)[..., 0]

@@ -22,10 +22,13 @@ class CommonOptions:
         hidden: units of each hidden layer of actor and critics.
         layer_norm: LayerNorm in the critics.
         discount: of future rewards, per step.
-        normalise_returns: divides rewards by the standard deviation of the log's Monte-Carlo returns, so that Q has
-            unit spread on any robot and the other weights mean the same everywhere.
+        normalise_returns: divides rewards by the standard deviation of the log's Monte-Carlo returns, truncated
+            episodes going on as rows do on average, so that Q has unit spread on any robot and the other weights mean
+            the same everywhere.
         return_temperature: real rows are drawn with chances exp(episode return / temperature), returns scaled to
             [0, 1], so that a mostly poor log teaches what its best episodes did; null draws uniformly.
+        fewest_episodes: the temperature is raised until rows come from at least so many episodes, each counted by its
+            share of the rows (their effective number), or from as many as uniform draws do.
         n_step: real steps whose rewards enter the temporal-difference target.
         target_rate: share of the critics that enters the target networks at each update.
         actor_learning_rate: Adam's.
@@ -44,6 +47,7 @@ class CommonOptions:
     discount: Share = 0.997
     normalise_returns: bool = True
     return_temperature: Positive | None = 0.1
+    fewest_episodes: Count = rare(20)
     n_step: Count = 20
     target_rate: NonzeroShare = rare(0.005)
     actor_learning_rate: Positive = 0.0003

@@ -3,7 +3,7 @@
 import contextlib
 import copy
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -17,6 +17,7 @@ from envtf_lit.agents.warm_start import WarmStart
 from envtf_lit.options.numbers import NonNegative
 
 INITIAL_ALPHA = 0.01  # weight of the entropy in the actor's objective at the start; learned from there on
+WARM_TARGET_RATE = 0.05  # share of the critics that enters the target networks at each update of the warm start
 CRITICS = 2  # of which targets and actor take the smallest
 
 
@@ -25,10 +26,11 @@ class SACOptions(PolicyOptions):
     """Soft Actor-Critic's own options.
 
     Attributes:
-        clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log.
+        clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log; of
+            the mean over action dimensions.
     """
 
-    clone_weight: NonNegative = 0.25
+    clone_weight: NonNegative = 0.75
 
 
 class Temperature(nn.Module):
@@ -44,6 +46,9 @@ class SAC(Agent):
 
     Options: ClassVar[type[PolicyOptions]] = SACOptions
     label = "SAC"
+    cures: ClassVar[Mapping[str, str]] = {
+        "": "lower critic_learning_rate, or warm up for longer with a larger warm_start"
+    }
     options: SACOptions
 
     def build_networks(self) -> None:
@@ -123,8 +128,20 @@ class SAC(Agent):
         follow(self.target_critics, self.critics, self.options.target_rate)
         super().update_targets()
 
+    @torch.no_grad()
+    def complete_returns(self, batch: Batch) -> Batch:
+        """`G + gamma^n min_i Q_i'(s_T, a'), a' ~ pi(s_T)` for episodes that were cut after n steps, in s_T.
+
+        What terminated keeps its return. The targets Q' follow the critics faster than later on: every other row holds
+        them to what was earned, so that nothing can run away.
+        """
+        follow(self.target_critics, self.critics, WARM_TARGET_RATE)
+        action, _ = self.actor.sample(batch["last_observations"], generator=self.generator)
+        beyond = self.target_critics(batch["last_observations"], action).min(0).values
+        return batch | {"returns": batch["returns"] + batch["tails"] * beyond}
+
     def warm_start_losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
-        """Critics regress on Monte-Carlo returns of the log; the actor clones it."""
+        """Critics regress on Monte-Carlo returns of the log, as `complete_returns` makes them; the actor clones it."""
         q = self.critics(batch["observations"], batch["actions"])
         loss = 0.5 * (q - batch["returns"]).square().mean(1).sum()
         yield "critics", loss, dict(warm_critic_loss=loss, q_data=q.mean())
@@ -136,7 +153,8 @@ class SAC(Agent):
 
     def validation_logs(self, batch: Batch) -> Logs:
         q = self.return_scale * self.critics(batch["observations"], batch["actions"]).min(0).values
-        return dict(q_data=q.mean(), return_error=(q - batch["returns"]).square().mean() / self.return_variance)
+        returns = batch["returns"] + batch["tails"] * self.typical_return
+        return dict(q_data=q.mean(), return_error=((q - returns) / self.return_spread).square().mean())
 
 
 @contextlib.contextmanager

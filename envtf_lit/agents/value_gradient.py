@@ -2,7 +2,8 @@
 
 import copy
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,10 +13,11 @@ from envtf_lit.agents.networks import StateValue
 from envtf_lit.agents.sac import held_fixed
 from envtf_lit.imagination.buffer import Imagination
 from envtf_lit.imagination.histories import Histories
-from envtf_lit.imagination.rollouts import Rollouts, gather_steps
+from envtf_lit.imagination.rollouts import Rollouts, gather_steps, lost
 from envtf_lit.options.numbers import Count, NonNegative, NonzeroShare, Positive
 from envtf_lit.options.schema import rare
 from envtf_lit.policy import TanhGaussianActor
+from envtf_lit.world_models.interface import Prediction
 from envtf_lit.world_models.unroll import Step, unroll
 
 HIDDEN = (256, 256)  # units of the state value
@@ -36,9 +38,10 @@ class ValueGradientOptions:
     Attributes:
         updates: of all the policy's updates, the last so many; each is one of the actor.
         rollouts: imagined at a time; each is carried on from update to update until the robot falls.
-        horizon: steps of each rollout per update, after which a learned state value stands for what follows.
+        horizon: steps of each rollout per update, after which a learned state value stands for what follows; fewer
+            where the model's held-out reach (`world_models.fit`) is shorter.
         learning_rate: Adam's, of the actor; reached after a tenth of these updates, from there linearly to zero.
-        clone_weight: weight in the actor's objective of cloning the real rows' actions.
+        clone_weight: weight in the actor's objective of cloning the real rows' actions, mean over action dimensions.
         actor_average: share of the actor that enters the averaged actor at each of these updates.
     """
 
@@ -46,8 +49,27 @@ class ValueGradientOptions:
     rollouts: Count = 64
     horizon: Count = 16
     learning_rate: Positive = 0.001
-    clone_weight: NonNegative = 0.05
+    clone_weight: NonNegative = 0.15
     actor_average: NonzeroShare = rare(0.05)
+
+
+@dataclass(frozen=True)
+class Paths(Rollouts):
+    """Rollouts under way, of which none has left; differentiable.
+
+    Attributes:
+        excess: (H, B) `log(novelty / novelty_limit)`, zero where the model knows its way.
+    """
+
+    excess: Tensor
+
+
+@dataclass(frozen=True)
+class Returns:
+    """Mean and standard deviation of the returns of the log's rows, in units of the paths' rewards."""
+
+    mean: float | Tensor
+    spread: float | Tensor
 
 
 class StateValues(nn.Module):
@@ -62,29 +84,42 @@ class StateValues(nn.Module):
         self.value = StateValue(observation_dim, hidden=HIDDEN)
         self.target_value = copy.deepcopy(self.value).requires_grad_(False)
 
-    def imagined_return(self, paths: Rollouts, discount: float) -> Tensor:
-        """(B,) `sum_k discount^k r_k + discount^H V(s_H)`, up to the fall (Xu et al. 2022, equation 5)."""
-        powers = discount ** torch.arange(len(paths.rewards) + 1, device=paths.rewards.device)[:, None]
-        weights = powers * standing(paths)
-        return (weights[:-1] * paths.rewards).sum(0) + weights[-1] * self.value(paths.next_observations[-1])
+    def imagined_return(self, paths: Paths, discount: float, log: Returns) -> Tensor:
+        """(B,) `sum_k discount^k r_k + discount^H V(s_H)`, up to the fall (Xu et al. 2022, equation 5).
+
+        Where the model has left what it knows, at a step k, its prediction counts for nothing: the path ends in s_k,
+        the last state that it knew, at what that is `worth`.
+        """
+        stands, taken = standing(paths)
+        powers = discount ** torch.arange(len(stands), device=stands.device)[:, None]
+        total = torch.where(taken, powers[:-1] * paths.rewards, 0.0).sum(0)
+        states = torch.cat([paths.observations, paths.next_observations[-1:]])
+        cut = (stands[:-1] & paths.halted).any(0)
+        last = torch.where(cut, stands.sum(0) - 1, len(taken))  # (B,) the state that each path ends in
+        end = self.value(states[last, torch.arange(len(last), device=last.device)])
+        excess = torch.where(stands[:-1] & paths.halted, paths.excess, 0.0).sum(0)
+        end = torch.where(cut, worth(end, excess, log), end)
+        return total + torch.where(cut | stands[-1], discount**last * end, 0.0)
 
     @torch.no_grad()
-    def value_targets(self, paths: Rollouts, discount: float) -> Tensor:
-        """(H, B) TD(lambda) targets under the slow state value (Xu et al. 2022, equations 6 and 7)."""
+    def value_targets(self, paths: Paths, discount: float, log: Returns) -> Tensor:
+        """(H, B) TD(lambda) targets under the slow state value (Xu et al. 2022, equations 6, 7), to a fall or a cut."""
         later = self.target_value(paths.next_observations)
+        cut = worth(self.target_value(paths.observations), paths.excess, log)
         target, targets = later[-1], torch.empty_like(paths.rewards)
         for t in reversed(range(len(targets))):
             target = (1.0 - TRACE) * later[t] + TRACE * target
-            target = targets[t] = paths.rewards[t] + discount * ~paths.terminated[t] * target
+            target = paths.rewards[t] + torch.where(paths.terminated[t], 0.0, discount * target)
+            target = targets[t] = torch.where(paths.halted[t], cut[t], target)
         return targets
 
     def value_batches(
-        self, paths: Rollouts, discount: float, generator: torch.Generator
+        self, paths: Paths, discount: float, log: Returns, generator: torch.Generator
     ) -> Iterator[tuple[Tensor, Tensor]]:
         """Batches of visited states and their targets, several times in random order."""
-        visited = standing(paths)[:-1].flatten() > 0
+        visited = standing(paths)[0][:-1].flatten()
         states = paths.observations.detach().flatten(0, 1)[visited]
-        targets = self.value_targets(paths, discount).flatten()[visited]
+        targets = self.value_targets(paths, discount, log).flatten()[visited]
         for _ in range(PASSES):
             order = torch.randperm(len(states), generator=generator, device=states.device)
             for rows in order.split(BATCH):
@@ -95,10 +130,26 @@ class StateValues(nn.Module):
         return (self.value(observations) - returns).square().mean()
 
 
-def standing(paths: Rollouts) -> Tensor:
-    """(H + 1, B), 1 where the robot has not fallen before that step; the last row is what outlives the path."""
-    stands = (~paths.terminated).float().cumprod(0)
-    return torch.cat([torch.ones_like(stands[:1]), stands])
+def standing(paths: Paths) -> tuple[Tensor, Tensor]:
+    """Which states and transitions of paths mean anything.
+
+    Returns:
+        (H + 1, B) bool, states that a path stands in, neither fallen nor lost before; the last row is what outlives the
+        path. (H, B) bool, transitions from there that the model knew enough to predict.
+    """
+    goes_on = (~(paths.terminated | paths.halted)).cumprod(0).bool()
+    stands = torch.cat([torch.ones_like(goes_on[:1]), goes_on])
+    return stands, stands[:-1] & ~paths.halted
+
+
+def worth(value: Tensor, excess: Tensor, log: Returns) -> Tensor:
+    """What a path is worth that the model can't follow further: `min(V(s), mean(G)) - std(G) log(novelty / limit)`.
+
+    Riches beyond what the log's rows earned need evidence, and here there is none; a state that is worse than those
+    stays so. Above their mean no action is taken for the sake of what lies behind. A bare end would have no gradient in
+    the action that led astray, and the steps before would go on to push it; so it costs the more the further it led.
+    """
+    return value.clamp(max=log.mean) - log.spread * excess
 
 
 class ImaginedPaths:
@@ -112,12 +163,15 @@ class ImaginedPaths:
     def __init__(self, imagination: Imagination, options: ValueGradientOptions) -> None:
         self.imagination, self.options = imagination, options
         self.histories: Histories | None = None
+        self.former: Any = None  # the model's state that the paths before began in, whose worlds go on
 
-    def next(self, actor: TanhGaussianActor, scale: Tensor, generator: torch.Generator) -> Rollouts:
+    def next(self, actor: TanhGaussianActor, scale: Tensor, generator: torch.Generator) -> Paths:
         """The next `horizon` steps under the actor's sampled actions, differentiable in the actor.
 
-        Each path runs in a world model of its own, drawn from the posterior as the rollouts' options say. No rollout
-        leaves where its robot falls: what comes after means nothing.
+        Each rollout runs, from its real state to its end, in a world model of its own, drawn from the posterior as the
+        rollouts' options say. They also say
+        what uncertainty costs, and where a path has left what the model knows. No rollout leaves where its robot falls,
+        or where it is lost: what comes after means nothing.
 
         Args:
             actor: acts.
@@ -128,30 +182,41 @@ class ImaginedPaths:
         if self.histories is None:
             self.histories = self.imagination.starts.draw(self.options.rollouts, o.history, generator)
             self.age = torch.zeros_like(self.histories.lengths)
+            self.former = None
         with torch.no_grad():
             state = self.histories.begin(model, posterior=o.posterior, generator=generator)
+            if self.former is not None:
+                state = model.same_worlds(state, self.former, self.age > 0)
+            self.former = state
 
         def act(t: int, rows: Tensor, observation: Tensor) -> Tensor:
             return actor.sample(observation, generator=generator)[0]
 
-        steps = unroll(model, state, act, self.options.horizon, mode=o.mode, generator=generator)
-        paths = gather_steps(map(self._with_falls, steps), self.options.rollouts)
+        steps = [*unroll(model, state, act, self.options.horizon, mode=o.mode, generator=generator)]
+        paths = gather_steps(map(self._with_ends, steps), self.options.rollouts)
         self._carry_on(paths, generator)
-        return replace(paths, rewards=paths.rewards / scale)
+        excess = torch.stack([self._excess(step.prediction) for step in steps])
+        return Paths(**vars(paths) | {"rewards": self.imagination.charged(paths) / scale, "excess": excess})
 
-    def _with_falls(self, step: Step) -> tuple[Step, Tensor, Tensor]:
+    def _with_ends(self, step: Step) -> tuple[Step, Tensor, Tensor]:
         fell = self.imagination.terminated(step.prediction.observation)
-        return step, fell, torch.zeros_like(fell)
+        return step, fell, ~fell & lost(step.prediction, self.imagination.options.novelty_limit)
+
+    def _excess(self, prediction: Prediction) -> Tensor:
+        limit, novelty = self.imagination.options.novelty_limit, prediction.novelty
+        if limit is None or novelty is None:
+            return torch.zeros_like(prediction.reward)
+        return (novelty / limit).clamp(min=1.0).log()
 
     @torch.no_grad()
     def _carry_on(self, paths: Rollouts, generator: torch.Generator) -> None:
-        """Where the next paths begin: at the ends of these, but at real states where robots fell or grew old."""
+        """Where the next paths begin: at the ends of these, but at real states where they ended or grew old."""
         history, horizon = self.imagination.options.history, self.options.horizon
         observations = torch.cat([paths.observations[horizon - history :], paths.next_observations[-1:]])
         actions = paths.actions[horizon - history :]
         fresh = self.imagination.starts.draw(self.options.rollouts, history, generator)
         self.age += horizon
-        ended = paths.terminated.any(0) | (self.age >= OLDEST)  # (B,)
+        ended = (paths.terminated | paths.halted).any(0) | (self.age >= OLDEST)  # (B,)
         self.age[ended] = 0
         self.histories = Histories(
             torch.where(ended[:, None, None], fresh.observations, observations.transpose(0, 1)),
@@ -193,17 +258,20 @@ class ValueGradient(Phase):
     def value_gradient_step(self, agent: Agent, batch: Batch, done: int) -> Logs:
         """One step of the actor along the gradient, and several of the state value."""
         values, discount = self.values, agent.options.discount
+        log = Returns(agent.typical_return / agent.return_scale, agent.return_spread / agent.return_scale)
         paths = self.paths.next(agent.actor, agent.return_scale, agent.generator)
         with held_fixed(values.value):
-            imagined = values.imagined_return(paths, discount).mean()
+            imagined = values.imagined_return(paths, discount, log).mean()
             clone_loss = agent.clone_loss(batch)
             loss = self.options.clone_weight * clone_loss - imagined
             agent.descend("actor_by_gradient", loss, rate=self.rate(done / self.updates), clip=CLIP)
         value_loss = torch.zeros(())
-        for observations, targets in values.value_batches(paths, discount, agent.generator):
+        for observations, targets in values.value_batches(paths, discount, log, agent.generator):
             value_loss = values.value_loss(observations, targets)
             agent.descend("value", value_loss)
-        return dict(imagined_value=imagined * agent.return_scale, value_loss=value_loss, clone_loss=clone_loss)
+        cut = (standing(paths)[0][:-1] & paths.halted).any(0).float().mean()
+        logs = dict(imagined_value=imagined * agent.return_scale, value_loss=value_loss, clone_loss=clone_loss)
+        return logs | {"cut_share": cut}
 
     def rate(self, progress: float) -> float:
         """The actor's learning rate after this share of the updates: up over the first tenth, then down to zero."""

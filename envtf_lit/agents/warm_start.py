@@ -13,6 +13,7 @@ class WarmStart(Phase):
 
     def update(self, agent: Agent, batch: Batch, done: int) -> Logs:
         logs: Logs = {}
+        batch = agent.complete_returns(batch)
         for part, loss, found in agent.warm_start_losses(batch):
             agent.descend(part, loss, rate=LEARNING_RATE)
             logs |= found

@@ -166,6 +166,7 @@ class AgentCLI(_LinkedCLI):
     from_data = ("observation_dim", "action_dim", "action_low", "action_high")
     links = {f"model.options.{name}": f"data.{name}" for name in ("batch_size", "discount", "n_step")} | {
         "model.options.return_temperature": "data.return_temperature",
+        "model.options.fewest_episodes": "data.fewest_episodes",
         "model.seed": "data.seed",
     }
 

@@ -15,6 +15,7 @@ from envtf_lit.data.loaders import (
     Resamples,
     Transitions,
     Windows,
+    effective_episodes,
     epoch_generator,
     return_weights,
 )
@@ -118,6 +119,7 @@ class TransitionData(L.LightningDataModule):
         discount: of future rewards, per step.
         n_step: steps whose rewards enter the temporal-difference target.
         return_temperature: of `return_weights`; None draws rows uniformly.
+        fewest_episodes: likewise.
         held_out: 0 takes all episodes; more leaves out those that the dataset says are held out, else that share of
             them, the ones that `WindowData` holds out with the same share and seed.
         seed: of all draws, and of that split.
@@ -131,13 +133,14 @@ class TransitionData(L.LightningDataModule):
         discount: float = 0.99,
         n_step: int = 1,
         return_temperature: float | None = None,
+        fewest_episodes: int = 20,
         held_out: float = 0.0,
         seed: int = 0,
     ) -> None:
         super().__init__()
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
         self.discount, self.n_step, self.seed = discount, n_step, seed
-        self.return_temperature = return_temperature
+        self.return_temperature, self.fewest_episodes = return_temperature, fewest_episodes
         whole = self.read(path)
         self.dataset = whole.split(held_out, seed=seed)[0] if held_out > 0 else whole
         self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
@@ -152,11 +155,21 @@ class TransitionData(L.LightningDataModule):
         """All rows of the dataset, with their n-step targets and returns to go."""
         return Transitions(self.dataset, discount=self.discount, n_step=self.n_step, device=_device(self))
 
+    @cached_property
+    def weights(self) -> Tensor | None:
+        """(N,) chances of each row, up to a factor; None where they are equal."""
+        temperature = self.return_temperature
+        return None if temperature is None else return_weights(self.dataset, temperature, self.fewest_episodes)
+
+    @cached_property
+    def effective_episodes(self) -> float:
+        """How many episodes rows come from, each counted by its share (`loaders.effective_episodes`)."""
+        weights = torch.ones(len(self.dataset)) if self.weights is None else self.weights
+        return effective_episodes(self.dataset, weights)
+
     def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
         """Batches (UPDATES_PER_STEP, batch_size, …) of `Transitions`."""
-        shape = (UPDATES_PER_STEP, self.batch_size)
-        temperature = self.return_temperature
-        weights = None if temperature is None else return_weights(self.dataset, temperature)
+        shape, weights = (UPDATES_PER_STEP, self.batch_size), self.weights
         rows, process = len(self.transitions), _process(self)
         sampler = DrawSampler(rows, shape, self.steps_per_epoch, seed=self.seed, weights=weights, process=process)
         return _loader(self.transitions, sampler)

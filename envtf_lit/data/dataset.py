@@ -148,7 +148,7 @@ class OfflineDataset:
     def returns_to_go(self, discount: float) -> np.ndarray:
         """(N,) float32, `G_t = r_t + discount * G_{t+1}` to the end of the episode, where G is zero beyond the log.
 
-        For a truncated episode this is a lower-biased estimate when rewards are positive.
+        A truncated episode's lack what would have followed: see `loaders.Transitions`.
         """
         returns = np.zeros(len(self), dtype=np.float64)
         longest = int(self.episode_lengths.max())

@@ -15,6 +15,7 @@ from torch.utils.data import Dataset, Sampler
 from envtf_lit.data.columns import Column, FileRows, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 
+BISECTIONS = 30  # of a temperature
 UPDATES_PER_STEP = 10  # gradient steps of an agent per Lightning training step: no host synchronisation between them
 
 
@@ -91,14 +92,40 @@ class DrawSampler(Sampler[Tensor]):
             yield drawn[..., self.share]
 
 
-def return_weights(dataset: OfflineDataset, temperature: float) -> Tensor:
+def return_weights(dataset: OfflineDataset, temperature: float, fewest_episodes: int = 1) -> Tensor:
     """(N,) `exp(R / temperature)`, R the row's episode return scaled to [0, 1] (Hong et al. 2023).
 
     A log that is mostly poor then teaches what its best episodes did; a small temperature means a sharp preference.
+
+    Args:
+        dataset: whose rows.
+        temperature: raised as far as it must be for rows to come from enough episodes.
+        fewest_episodes: effective number of episodes (`effective_episodes`) that rows come from, or as many as equal
+            chances give.
     """
-    returns = dataset.episode_returns
+    returns, even = dataset.episode_returns, torch.ones(len(dataset))
     scaled = (returns - returns.min()) / (np.ptp(returns) or 1.0)  # 1: all are equal
-    return torch.as_tensor(np.exp((scaled - 1.0) / temperature)[dataset.episode_index])
+
+    def weights(inverse: float) -> Tensor:
+        return torch.as_tensor(np.exp((scaled - 1.0) * inverse)[dataset.episode_index])
+
+    def enough(inverse: float) -> bool:
+        return effective_episodes(dataset, weights(inverse)) >= floor
+
+    floor = min(float(fewest_episodes), effective_episodes(dataset, even))
+    low, high = 0.0, 1.0 / temperature  # of the inverse: equal chances are enough
+    if enough(high):
+        return weights(high)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if enough(middle) else (low, middle)
+    return weights(low)
+
+
+def effective_episodes(dataset: OfflineDataset, weights: Tensor) -> float:
+    """`(sum_e p_e)^2 / sum_e p_e^2`, p_e the chance that a row drawn by weights (N,) is of episode e (Kish 1965)."""
+    chances = np.add.reduceat(weights.double().numpy(), dataset.episode_starts)
+    return float(chances.sum() ** 2 / np.square(chances).sum())
 
 
 class Store:
@@ -207,7 +234,13 @@ class Transitions(Dataset[dict[str, Tensor]]):
 
     Columns: `observations`, `actions`, `rewards` (discounted sum over the n steps, or as many as the episode has
     left), `next_observations` (where those steps end), `discounts` (`discount ** steps`, zero if the task terminated
-    there: what the value of `next_observations` counts for), `returns`.
+    there: what the value of `next_observations` counts for), `following_observations` (after one step alone); `returns`
+    (discounted sum over all steps that the episode has left), `last_observations` (where it ends) and `tails` (what the
+    value there counts for, likewise: a return that the log cut short is `returns + tails * V(last_observations)`).
+
+    Attributes:
+        typical_return: mean discounted return of the rows, `mean(returns) / (1 - mean(tails))`: that for which
+            truncated episodes go on as rows do on average.
     """
 
     def __init__(
@@ -219,19 +252,25 @@ class Transitions(Dataset[dict[str, Tensor]]):
         rewards = np.zeros(len(dataset))
         for k in range(n_step):
             rewards += np.where(rows + k <= end, discount**k * dataset.rewards[np.minimum(rows + k, last)], 0.0)
-        discounts = discount ** (end - rows + 1.0) * ~dataset.terminated[end]
+        discounts, tails = (discount ** (row - rows + 1.0) * ~dataset.terminated[row] for row in (end, last))
+        returns = dataset.returns_to_go(discount)
+        self.typical_return = float(returns.mean(dtype=np.float64) / (1.0 - tails.mean()))
         self.states = Store(dataset, ("observations", "actions"), device)
         self.following = Store(dataset, ("next_observations",), device)
-        self.columns = dict(
-            rewards=torch.as_tensor(rewards).float().to(device),
-            discounts=torch.as_tensor(discounts).float().to(device),
-            returns=torch.as_tensor(dataset.returns_to_go(discount)).to(device),
-        )
-        self.end = torch.as_tensor(end, device=device)  # (N,) the row in which the n steps of each row end
+        columns = dict(rewards=rewards, discounts=discounts, returns=returns, tails=tails)
+        self.columns = {name: torch.as_tensor(column).float().to(device) for name, column in columns.items()}
+        # (N,) the rows in which the n steps of each row end, and its episode
+        self.end, self.last = torch.as_tensor(end, device=device), torch.as_tensor(last, device=device)
 
     def __len__(self) -> int:
         return len(self.end)
 
     def __getitem__(self, rows: Tensor) -> dict[str, Tensor]:
         rows = rows.to(self.end.device)
-        return self.states[rows] | self.following[self.end[rows]] | {name: c[rows] for name, c in self.columns.items()}
+        ends = dict(next_observations=self.end[rows], following_observations=rows, last_observations=self.last[rows])
+        following = {name: self.following[row]["next_observations"] for name, row in ends.items()}
+        return self.states[rows] | following | {name: column[rows] for name, column in self.columns.items()}
+
+    def complete_returns(self) -> Tensor:
+        """(N,) returns to go in which truncated episodes go on at the `typical_return`."""
+        return self.columns["returns"] + self.columns["tails"] * self.typical_return

@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from envtf_lit.world_models.forecast import Forecast, Scale, Trajectories, forecast, nmse
+from envtf_lit.world_models.forecast import Forecast, Scale, Trajectories, forecast, nmse, steps_within
 from envtf_lit.world_models.interface import WorldModel
 
 THRESHOLDS = (0.01, 0.1)
@@ -40,23 +39,6 @@ class Steps:
         values = steps.double().cpu().numpy()
         spread = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
         return cls(float(values.mean()), float(spread), float(np.median(values)), float(censored.double().mean()))
-
-
-def steps_within(error: Tensor, lengths: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
-    """`L = min{h >= 1: nmse_h > threshold} - 1` of each trajectory, or its length where no step exceeds.
-
-    Args:
-        error: (B, T), nmse_h in column h - 1.
-        lengths: (B,) valid steps.
-        threshold: of the nmse.
-
-    Returns:
-        (B,) int64 steps and (B,) bool, True where censored by the trajectory's end.
-    """
-    columns = torch.arange(error.shape[1], device=error.device)
-    exceeds = (error > threshold) & (columns < lengths[:, None])
-    first = torch.where(exceeds.any(1), exceeds.int().argmax(1), lengths)
-    return first, ~exceeds.any(1)
 
 
 def error_quartiles(error: Tensor, lengths: Tensor) -> dict[str, np.ndarray]:

@@ -8,9 +8,9 @@ import torch
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from envtf_lit.evaluation.calibration import coverage
-from envtf_lit.evaluation.horizon import HorizonReport, error_quartiles, steps_within
+from envtf_lit.evaluation.horizon import HorizonReport, error_quartiles
 from envtf_lit.figures.style import COLOURS, drawing, featured, observation_labels, write_table
-from envtf_lit.world_models.forecast import Scale
+from envtf_lit.world_models.forecast import Scale, steps_within
 
 
 def horizon_errors(report: HorizonReport, path: str | Path) -> Path:

@@ -40,20 +40,30 @@ class Imagination:
         self.reward_std = float(dataset.rewards.std())
 
     def rollouts(self, policy: Policy, generator: torch.Generator) -> Rollouts:
-        """New branched rollouts under the policy's sampled actions."""
+        """New branched rollouts under the policy's sampled actions, in fp32 whatever the precision around it.
+
+        In bf16 the noise of a hidden token points where no training token did: it would pass for novelty, and for
+        epistemic variance.
+        """
         o = self.options
-        return imagine(
-            self.model,
-            policy,
-            self.starts.draw(o.branches, o.history, generator),
-            horizon=o.horizon,
-            expansion=o.value_expansion,
-            terminated=self.terminated,
-            novelty_limit=o.novelty_limit,
-            mode=o.mode,
-            posterior=o.posterior,
-            generator=generator,
-        )
+        with torch.autocast(self.starts.starts.device.type, enabled=False):
+            return imagine(
+                self.model,
+                policy,
+                self.starts.draw(o.branches, o.history, generator),
+                horizon=o.horizon,
+                expansion=o.value_expansion,
+                terminated=self.terminated,
+                novelty_limit=o.novelty_limit,
+                mode=o.mode,
+                posterior=o.posterior,
+                generator=generator,
+            )
+
+    def charged(self, rollouts: Rollouts) -> Tensor:
+        """(H, B) rewards less the penalty `weight * std(r) * u`, std(r) over the data; differentiable in the states."""
+        weight = self.options.penalty * self.reward_std
+        return rollouts.rewards - weight * rollouts.uncertainty if weight > 0 else rollouts.rewards
 
 
 class Ring(nn.Module):
@@ -75,6 +85,7 @@ class Ring(nn.Module):
             actions=(action_dim,),
             rewards=(),
             next_observations=(observation_dim,),
+            following_observations=(observation_dim,),
             discounts=(),
         )
         for name, shape in self.widths.items():
@@ -102,6 +113,10 @@ class Ring(nn.Module):
 class ImaginedBatches(nn.Module):
     """A source of mixed batches: `1 - real_ratio` of each batch's rows are imagined ones.
 
+    Attributes:
+        cut_share: of the round of rollouts that the last `mix` began with, those halted where the model had left what
+            it knows; None where it began with none.
+
     Args:
         imagination: where new rollouts come from.
         stored: rollouts to begin with.
@@ -122,6 +137,7 @@ class ImaginedBatches(nn.Module):
         capacity = ROUNDS_KEPT * o.branches * o.horizon if refresh_every else len(stored)
         self.ring = Ring(stored.observations.shape[-1], stored.actions.shape[-1], max(1, capacity))
         self.register_buffer("reward_scale", torch.ones(()))  # rewards are divided by it
+        self.cut_share: Tensor | None = None
 
     def begin(self, reward_scale: Tensor) -> None:
         """Takes the agent's reward scale, and the stored rollouts into the ring."""
@@ -138,8 +154,10 @@ class ImaginedBatches(nn.Module):
             policy: acts in new rollouts.
             generator: of rollouts and rows.
         """
+        self.cut_share = None
         if self.refresh_every > 0 and done % self.refresh_every == 0:
             rollouts = self.imagination.rollouts(policy, generator)
+            self.cut_share = rollouts.halted.any(0).float().mean()
             self.add_rollouts(rollouts, horizon=self.imagination.options.horizon)
         kept = round(self.real_ratio * len(batch["real"]))
         imagined = self.ring.draw(len(batch["real"]) - kept, generator)
@@ -147,11 +165,9 @@ class ImaginedBatches(nn.Module):
         return {name: torch.cat([batch[name][:kept], column]) for name, column in imagined.items()}
 
     def add_rollouts(self, rollouts: Rollouts, *, horizon: int) -> None:
-        """Puts the first `horizon` steps into the ring, rewards less the penalty `weight * std(r) * u`."""
-        o = self.imagination.options
-        rewards = rollouts.rewards - o.penalty * self.imagination.reward_std * rollouts.uncertainty
-        rewards = rewards / self.reward_scale
-        if o.value_expansion > 0:
+        """Puts the first `horizon` steps into the ring, rewards less the penalty."""
+        rewards = self.imagination.charged(rollouts) / self.reward_scale
+        if self.imagination.options.value_expansion > 0:
             total, end, weight = rollouts.returns(rewards, self.discount)
         else:
             weight = self.discount * (~rollouts.terminated).float()
@@ -161,6 +177,7 @@ class ImaginedBatches(nn.Module):
             actions=rollouts.actions,
             rewards=total,
             next_observations=end,
+            following_observations=rollouts.next_observations,
             discounts=weight,
         )
         taken = rollouts.valid.clone()

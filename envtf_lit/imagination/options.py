@@ -39,14 +39,15 @@ class RolloutOptions:
         horizon: steps of each rollout, unless the robot falls first.
         value_expansion: deterministic steps after the horizon, which are not learned from but whose rewards, and end,
             enter the targets of the steps before them (model-based value expansion, Feinberg et al. 2018); 0 learns
-            from single imagined steps.
+            from single imagined steps; fewer where the model's held-out reach (`world_models.fit`) is shorter.
         history: real steps given to the model before the branch point.
         mode: `sample` draws each next state from the model, `mean` takes its mean.
         posterior: above zero each rollout runs in a world model of its own, drawn from the posterior of the last layer
             with its deviation from the mean times this.
-        penalty: weight of the uncertainty u, in units of the data's reward standard deviation: `r - weight * std * u`.
+        penalty: weight of the uncertainty u, in units of the data's reward standard deviation: `r - weight * std * u`;
+            in the value gradient's paths, too.
         novelty_limit: rollouts end where the model's epistemic variance passes this multiple of its 0.999 quantile over
-            the training data; null lets them go on.
+            the training data, and so do the value gradient's paths; null lets them go on.
     """
 
     branches: Count = 1_500

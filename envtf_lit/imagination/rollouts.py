@@ -145,7 +145,7 @@ def imagine(
         columns = []
         for step in steps:
             fell = terminated(step.prediction.observation)
-            halted = ~fell & _lost(step.prediction, novelty_limit)
+            halted = ~fell & lost(step.prediction, novelty_limit)
             ended[step.rows] = fell | halted
             columns.append((step, fell, halted))
         parts.append(gather_steps(columns, len(some)))
@@ -175,7 +175,7 @@ def _spread(column: Tensor, rows: Tensor, count: int) -> Tensor:
     return column.new_zeros(count, *column.shape[1:]).index_copy(0, rows, column)
 
 
-def _lost(prediction: Prediction, novelty_limit: float | None) -> Tensor:
+def lost(prediction: Prediction, novelty_limit: float | None) -> Tensor:
     """(R,) where the model has left what it knows, so far as anyone wants to know."""
     if novelty_limit is None:
         return torch.zeros_like(prediction.reward, dtype=torch.bool)

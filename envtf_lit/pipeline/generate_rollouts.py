@@ -17,12 +17,14 @@ from envtf_lit.pipeline.stage import (
     POLICIES,
     WORLD_MODELS,
     note_timing,
+    robot_of,
     rollouts_file,
     run_settings,
     run_stage,
 )
 from envtf_lit.policy import load_policy
-from envtf_lit.training import autocast, pick_device
+from envtf_lit.training import pick_device
+from envtf_lit.world_models.observed import as_observed
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination_head import termination_rule
 
@@ -64,21 +66,20 @@ def _imagine(params: Params, root: Path, name: str) -> Rollouts:
     """The policy's rollouts in the world model; their rate goes to the side file."""
     options, device, folder = params.generate_rollouts, pick_device(), root / WORLD_MODELS / name
     points = BranchPoints(load_dataset(dataset_of(params, root)), device)
-    model = load_world_model(folder, fused=params.compile).to(device)
+    model = as_observed(load_world_model(folder, fused=params.compile).to(device), robot_of(params))
     policy = load_policy(root / POLICIES / options.policy).to(device)
     generator = torch.Generator(device).manual_seed(params.seed)
     histories = points.draw_stretches(options.branches, options.history, STRETCH, generator)
     check_writable(rollouts_file(root, name), folder=False)  # only now: a refused call leaves no folder
     begin = time.perf_counter()
-    with autocast(device, params.precision):
-        rollouts = imagine(
-            model,
-            NoisyPolicy(policy, options.exploration),
-            histories,
-            horizon=options.horizon,
-            terminated=termination_rule(params.task, folder, device),
-            novelty_limit=options.novelty_limit,
-            generator=generator,
-        )
+    rollouts = imagine(
+        model,
+        NoisyPolicy(policy, options.exploration),
+        histories,
+        horizon=options.horizon,
+        terminated=termination_rule(params.task, folder, device),
+        novelty_limit=options.novelty_limit,
+        generator=generator,
+    )
     note_timing(root, "imagined_transitions_per_second", len(rollouts) / (time.perf_counter() - begin))
     return rollouts

@@ -3,12 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+
+from envtf_lit.agents.combo import ImaginingOptions
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.agents.store import publish_policy
 from envtf_lit.data.datamodules import TransitionData
-from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import UPDATES_PER_STEP, return_weights
+from envtf_lit.data.loaders import UPDATES_PER_STEP
 from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.dataset import dataset_of
@@ -16,12 +18,15 @@ from envtf_lit.pipeline.params import Params, algorithm_of, one_of
 from envtf_lit.pipeline.stage import (
     POLICIES,
     WORLD_MODELS,
+    robot_of,
     rollouts_file,
     run_settings,
     run_stage,
     unseen,
 )
 from envtf_lit.training import pick_device, run_folder, trained
+from envtf_lit.world_models.fit import REACH, known_reach
+from envtf_lit.world_models.observed import as_observed
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination_head import termination_rule
 
@@ -47,6 +52,8 @@ def train_policy(
     options, target = params.train_policy[name], root / POLICIES / name
     with run_stage(f"train_policy_{name}", params, root):
         algorithm = ALGORITHMS[algorithm_of(options)]
+        if isinstance(options, ImaginingOptions):
+            options = within_reach(options, root / WORLD_MODELS / options.world_model)
         data = transition_data(dataset_of(params, root), options, seed=params.seed, **unseen(params))
         agent = algorithm(
             data.observation_dim,
@@ -55,7 +62,7 @@ def train_policy(
             action_low=data.action_low,
             action_high=data.action_high,
             seed=params.seed,
-            source=imagined_batches(params, root, options, data.dataset) if algorithm.imagines else None,
+            source=imagined_batches(params, root, options, data) if algorithm.imagines else None,
         )
         inputs = [dataset_of(params, root)]
         if algorithm.imagines:
@@ -74,6 +81,23 @@ def train_policy(
             return publish_policy(target, agent.average_actor, curves, curves.rows[-1], settings)
 
 
+def within_reach(options: ImaginingOptions, model: Path) -> ImaginingOptions:
+    """The options with paths no longer than the world model's held-out reach, as its folder says; a note if that cuts.
+
+    Args:
+        options: of a policy that imagines.
+        model: folder of the world model; one of an earlier version says nothing, and nothing is cut.
+    """
+    steps = known_reach(model)
+    if steps is None or (cut := options.within(steps)) == options:
+        return options
+    asked, now = options.path_lengths, cut.path_lengths
+    changes = [f"{name} is {now[name]}, not {length}" for name, length in asked.items() if now[name] != length]
+    note = f"{model} reaches {steps} steps before its error passes 0.1 ({REACH}): {' and '.join(changes)}."
+    Console(stderr=True).print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    return cut
+
+
 def transition_data(dataset: Path, options: PolicyOptions, *, seed: int, held_out: float = 0.0) -> TransitionData:
     """The rows that such options are trained on.
 
@@ -90,22 +114,22 @@ def transition_data(dataset: Path, options: PolicyOptions, *, seed: int, held_ou
         discount=options.discount,
         n_step=options.n_step,
         return_temperature=options.return_temperature,
+        fewest_episodes=options.fewest_episodes,
         held_out=held_out,
         seed=seed,
     )
 
 
-def imagined_batches(params: Params, root: Path, options: Any, dataset: OfflineDataset) -> ImaginedBatches:
+def imagined_batches(params: Params, root: Path, options: Any, data: TransitionData) -> ImaginedBatches:
     """The source of imagined rows that a policy's options name."""
     device, folder = pick_device(), root / WORLD_MODELS / options.world_model
-    temperature = options.return_temperature
     imagination = Imagination(
-        load_world_model(folder, fused=params.compile).to(device),
-        dataset,
+        as_observed(load_world_model(folder, fused=params.compile).to(device), robot_of(params)),
+        data.dataset,
         termination_rule(params.task, folder, device),
         options.rollouts,
         device,
-        weights=None if temperature is None else return_weights(dataset, temperature),  # as the real rows are drawn
+        weights=data.weights,  # as the real rows are drawn
     )
     return ImaginedBatches(
         imagination,

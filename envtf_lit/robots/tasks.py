@@ -44,7 +44,9 @@ class Robot:
     """A simulated robot and what is known of it without data.
 
     `return_random` and `return_expert` are D4RL's reference returns, measured on the older -v2 environments; scores on
-    -v5 are therefore comparable among themselves, not with D4RL's tables.
+    -v5 are therefore comparable among themselves, not with D4RL's tables. Two things set -v5 apart. The step in which
+    Hopper, Walker2d or Ant falls lacks the reward of one for being healthy that it has in -v4. Ant pays for contact
+    forces, up to 0.039 a step, whether it observes them or not; in D4RL's Ant they are zero, and -v4's pays nothing.
 
     `variant` is empty for the robot as the twenty tasks have it, else the suffix of its tasks' names: `-v4` for
     Gymnasium's older simulation, `-105d` for Ant with the contact forces among its observations, `-hidden` for a body

@@ -248,3 +248,9 @@ class EnsembleDynamics(nn.Module):
         """See `WorldModel.gather`."""
         drawn = None if state.drawn is None else state.drawn[index]
         return replace(state, observation=state.observation[index], drawn=drawn)
+
+    def same_worlds(self, state: EnsembleState, former: EnsembleState, rows: Tensor) -> EnsembleState:
+        """See `WorldModel.same_worlds`."""
+        if state.drawn is None or former.drawn is None:
+            return state
+        return replace(state, drawn=torch.where(rows, former.drawn, state.drawn))

@@ -2,16 +2,23 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+from torch import nn
 
 from envtf_lit.data.datamodules import WindowData
-from envtf_lit.files import replacing
+from envtf_lit.files import read_json, replacing
 from envtf_lit.options.schema import Precision
 from envtf_lit.training import Curves, record_training, run_folder, trained
+from envtf_lit.world_models.forecast import Scale, forecast, median_steps_within, nmse, segments
+from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.lit import LitWorldModel, lit_world_model, window_data
 from envtf_lit.world_models.options import WorldModelOptions
 from envtf_lit.world_models.store import save_world_model
 from envtf_lit.world_models.termination_head import TERMINATION, learn_termination, save_termination
+
+REACH, TOLERATED = "open_loop_0.1_median", 0.1  # name of a model's reach, and the nmse up to which it reaches
+REACH_SEGMENTS, REACH_STEPS = 100, 100  # held-out stretches that it is taken from
 
 
 def fit_world_model(
@@ -41,8 +48,8 @@ def fit_world_model(
         progress: shows a bar.
 
     Returns:
-        Parameters, epoch of the kept weights, and their held-out errors; those of the termination head, too, where
-        the data are of a robot whose rule is unknown, and some episode terminates.
+        Parameters, epoch of the kept weights, their held-out errors, and their `reach`; errors of the termination head,
+        too, where the data are of a robot whose rule is unknown, and some episode terminates.
     """
     data = window_data(str(dataset), options, seed=seed)
     lit = lit_world_model(data.observation_dim, data.action_dim, options, seed=seed, compile=compile)
@@ -86,6 +93,7 @@ def publish_world_model(
     names = {"epoch": "epoch", "open_loop_error": "val/open_loop_error", "val_loss": "val/loss"}
     metrics: dict[str, Any] = {"parameters": sum(p.numel() for p in lit.best_model.parameters())}
     metrics |= {name: best[column] for name, column in names.items() if column in best}
+    metrics[REACH] = reach(lit.best_model, data, seed=lit.seed)
     head = learn_termination(data.train, seed=lit.seed) if data.dataset.task is None else None
     with replacing(target) as folder:
         save_world_model(folder, lit.best_model)
@@ -94,3 +102,24 @@ def publish_world_model(
             metrics |= head.scores(data.test)
         record_training(folder, metrics, settings, curves)
     return metrics
+
+
+def reach(model: WorldModel, data: WindowData, *, seed: int) -> int:
+    """Steps before a model's open loop passes an nmse of 0.1: the median over held-out stretches, at most 100.
+
+    Args:
+        model: with parameters, in eval mode.
+        data: set up.
+        seed: of the stretches' beginnings.
+    """
+    device = next(cast(nn.Module, model).parameters()).device
+    stretches = segments(data.held_out, REACH_SEGMENTS, REACH_STEPS, seed=seed).to(device)
+    error = nmse(forecast(model, stretches, feedback="imagined").mean, stretches, Scale.of(data.train, device))
+    return median_steps_within(error, stretches.lengths, TOLERATED)
+
+
+def known_reach(folder: Path) -> int | None:
+    """The `reach` that stands in a published world model's metrics; None in a folder of an earlier version."""
+    path = folder / "metrics.json"
+    found = read_json(path).get(REACH) if path.exists() else None
+    return int(found) if isinstance(found, int | float) else None

@@ -182,6 +182,40 @@ def nmse(mean: Tensor, trajectories: Trajectories, scale: Scale) -> Tensor:
     return error.double().square().mean(-1).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
 
+def steps_within(error: Tensor, lengths: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
+    """`L = min{h >= 1: nmse_h > threshold} - 1` of each trajectory, or its length where no step exceeds.
+
+    Args:
+        error: (B, T), nmse_h in column h - 1.
+        lengths: (B,) valid steps.
+        threshold: of the nmse.
+
+    Returns:
+        (B,) int64 steps and (B,) bool, True where censored by the trajectory's end.
+    """
+    columns = torch.arange(error.shape[1], device=error.device)
+    exceeds = (error > threshold) & (columns < lengths[:, None])
+    first = torch.where(exceeds.any(1), exceeds.int().argmax(1), lengths)
+    return first, ~exceeds.any(1)
+
+
+def median_steps_within(error: Tensor, lengths: Tensor, threshold: float) -> int:
+    """The most steps within which at least half of all trajectories stay, had none of them ended (Kaplan, Meier 1958).
+
+    An episode's end says nothing about the steps that would have followed. Arguments as of `steps_within`; where too
+    few exceed the threshold it is the longest trajectory's length.
+    """
+    steps, censored = steps_within(error, lengths, threshold)
+    within = 1.0
+    for h in range(1, int(lengths.max()) + 1):
+        under_way = int((steps >= h - 1).sum() - ((steps == h - 1) & censored).sum())
+        failed = int(((steps == h - 1) & ~censored).sum())
+        within *= 1.0 - failed / max(1, under_way)
+        if within < 0.5 - 1e-9:  # rounding
+            return h - 1
+    return int(lengths.max())
+
+
 def open_loop_error(model: WorldModel, trajectories: Trajectories, scale: Scale) -> float:
     """Geometric mean of the open-loop nmse over all steps: the number models are selected by.
 

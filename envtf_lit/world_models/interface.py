@@ -96,3 +96,10 @@ class WorldModel(Protocol):
     def gather(self, state: Any, index: Tensor) -> Any:
         """The rows of these indices (K,), in the order given."""
         ...
+
+    def same_worlds(self, state: Any, former: Any, rows: Tensor) -> Any:
+        """A state of `init` in which these rows (B,) bool run in the drawn models that those of `former` ran in.
+
+        For rollouts that are carried on from a history of their own. `former` may have been consumed.
+        """
+        ...

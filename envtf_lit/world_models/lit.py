@@ -286,7 +286,8 @@ class LitEnsemble(LitWorldModel):
 
     def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
         model = self.model if self.trainer.state.fn == "fit" else self.best
-        squared, entries = model.squared_error(batch)
+        with torch.autocast(self.device.type, enabled=False):  # members are ranked by it
+            squared, entries = model.squared_error(batch)
         self.squared, self.entries = self.squared + squared, self.entries + entries
 
     def on_validation_epoch_end(self) -> None:

@@ -257,6 +257,12 @@ class EnvironmentTransformer(nn.Module):
         """See `WorldModel.gather`."""
         return state.gather(index)
 
+    def same_worlds(self, state: TransformerState, former: TransformerState, rows: Tensor) -> TransformerState:
+        """See `WorldModel.same_worlds`."""
+        if state.drawn is None or former.drawn is None:
+            return state
+        return replace(state, drawn=torch.where(rows[:, None, None], former.drawn, state.drawn))
+
     def fuse(self) -> None:
         """Lets `step` run through torch.compile from now on: by blocks, which are alike, so that one serves all."""
         for block in self._stack():
