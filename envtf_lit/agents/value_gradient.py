@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from envtf_lit.agents.actor_critic import held_fixed
 from envtf_lit.agents.agent import Agent, Batch, Logs, Phase, follow
 from envtf_lit.agents.networks import StateValue
-from envtf_lit.agents.sac import held_fixed
 from envtf_lit.imagination.buffer import Imagination
 from envtf_lit.imagination.histories import Histories
 from envtf_lit.imagination.rollouts import Rollouts, gather_steps
@@ -193,6 +193,7 @@ class ValueGradient(Phase):
     def value_gradient_step(self, agent: Agent, batch: Batch, done: int) -> Logs:
         """One step of the actor along the gradient, and several of the state value."""
         values, discount = self.values, agent.options.discount
+        assert isinstance(agent.actor, TanhGaussianActor)
         paths = self.paths.next(agent.actor, agent.return_scale, agent.generator)
         with held_fixed(values.value):
             imagined = values.imagined_return(paths, discount).mean()
