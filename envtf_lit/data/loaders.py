@@ -5,6 +5,7 @@ it. The batches are the same to the bit. Every epoch draws from a generator seed
 an epoch's start sees the same rows as one that was never interrupted.
 """
 
+import copy
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -117,6 +118,12 @@ class Store:
         resident = _fits(sum(column.nbytes for column in columns.values()), self.device)
         self.columns = {name: _place(column, self.device, resident) for name, column in columns.items()}
 
+    def only(self, *names: str) -> "Store":
+        """The same columns, in the same place, but no others."""
+        store = copy.copy(self)
+        store.columns = {name: self.columns[name] for name in names}
+        return store
+
     def __getitem__(self, rows: Tensor) -> dict[str, Tensor]:
         """Row numbers (...) on any device to each column's rows (..., D) on the store's."""
         return {name: self._gather(column, rows) for name, column in self.columns.items()}
@@ -207,7 +214,8 @@ class Transitions(Dataset[dict[str, Tensor]]):
 
     Columns: `observations`, `actions`, `rewards` (discounted sum over the n steps, or as many as the episode has
     left), `next_observations` (where those steps end), `discounts` (`discount ** steps`, zero if the task terminated
-    there: what the value of `next_observations` counts for), `returns`.
+    there: what the value of `next_observations` counts for), `returns`, `next_actions` (recorded there) and `followed`
+    (whether any was: 0 where the episode ends).
     """
 
     def __init__(
@@ -221,17 +229,21 @@ class Transitions(Dataset[dict[str, Tensor]]):
             rewards += np.where(rows + k <= end, discount**k * dataset.rewards[np.minimum(rows + k, last)], 0.0)
         discounts = discount ** (end - rows + 1.0) * ~dataset.terminated[end]
         self.states = Store(dataset, ("observations", "actions"), device)
+        self.actions = self.states.only("actions")
         self.following = Store(dataset, ("next_observations",), device)
         self.columns = dict(
             rewards=torch.as_tensor(rewards).float().to(device),
             discounts=torch.as_tensor(discounts).float().to(device),
             returns=torch.as_tensor(dataset.returns_to_go(discount)).to(device),
+            followed=torch.as_tensor(end < last).float().to(device),
         )
         self.end = torch.as_tensor(end, device=device)  # (N,) the row in which the n steps of each row end
+        self.after = torch.as_tensor(np.minimum(end + 1, last), device=device)  # (N,) the row behind them
 
     def __len__(self) -> int:
         return len(self.end)
 
     def __getitem__(self, rows: Tensor) -> dict[str, Tensor]:
         rows = rows.to(self.end.device)
-        return self.states[rows] | self.following[self.end[rows]] | {name: c[rows] for name, c in self.columns.items()}
+        following = self.following[self.end[rows]] | {"next_actions": self.actions[self.after[rows]]["actions"]}
+        return self.states[rows] | following | {name: c[rows] for name, c in self.columns.items()}
