@@ -105,6 +105,9 @@ class WindowData(L.LightningDataModule):
 class TransitionData(L.LightningDataModule):
     """Transitions for agents, several batches at a time.
 
+    Attributes:
+        chances: (N,) of each row, beside those of `return_weights`; None for equal ones. An agent may set them.
+
     Args:
         path: dataset file, HDF5 or NPZ.
         batch_size: rows per gradient step and process.
@@ -116,6 +119,8 @@ class TransitionData(L.LightningDataModule):
             them, the ones that `WindowData` holds out with the same share and seed.
         seed: of all draws, and of that split.
     """
+
+    chances: Tensor | None
 
     def __init__(
         self,
@@ -131,7 +136,7 @@ class TransitionData(L.LightningDataModule):
         super().__init__()
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
         self.discount, self.n_step, self.seed = discount, n_step, seed
-        self.return_temperature = return_temperature
+        self.return_temperature, self.chances = return_temperature, None
         whole = self.read(path)
         self.dataset = whole.split(held_out, seed=seed)[0] if held_out > 0 else whole
         self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
@@ -149,8 +154,9 @@ class TransitionData(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
         """Batches (UPDATES_PER_STEP, batch_size, …) of `Transitions`."""
         shape = (UPDATES_PER_STEP, self.batch_size)
-        temperature = self.return_temperature
-        weights = None if temperature is None else return_weights(self.dataset, temperature)
+        temperature, weights = self.return_temperature, self.chances
+        if temperature is not None:
+            weights = return_weights(self.dataset, temperature) * (1.0 if weights is None else weights)
         rows, process = len(self.transitions), _process(self)
         sampler = DrawSampler(rows, shape, self.steps_per_epoch, seed=self.seed, weights=weights, process=process)
         return _loader(self.transitions, sampler)
