@@ -1,5 +1,7 @@
 """Batches of real and imagined rows: rollouts of the current policy, the newest kept in a ring."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -54,6 +56,10 @@ class Imagination:
             posterior=o.posterior,
             generator=generator,
         )
+
+    def penalty(self, rollouts: Rollouts) -> Tensor:
+        """(H, B) `weight * std(r) * u`: what imagined rewards lose, unless an algorithm says otherwise."""
+        return self.options.penalty * self.reward_std * rollouts.uncertainty
 
 
 class Ring(nn.Module):
@@ -118,6 +124,7 @@ class ImaginedBatches(nn.Module):
         super().__init__()
         self.imagination, self.stored, self.discount = imagination, stored, discount
         self.real_ratio, self.refresh_every = real_ratio, refresh_every
+        self.penalty: Callable[[Rollouts], Tensor] = imagination.penalty  # MOPO has its own
         o = imagination.options
         capacity = ROUNDS_KEPT * o.branches * o.horizon if refresh_every else len(stored)
         self.ring = Ring(stored.observations.shape[-1], stored.actions.shape[-1], max(1, capacity))
@@ -147,10 +154,9 @@ class ImaginedBatches(nn.Module):
         return {name: torch.cat([batch[name][:kept], column]) for name, column in imagined.items()}
 
     def add_rollouts(self, rollouts: Rollouts, *, horizon: int) -> None:
-        """Puts the first `horizon` steps into the ring, rewards less the penalty `weight * std(r) * u`."""
+        """Puts the first `horizon` steps into the ring, rewards less the penalty."""
         o = self.imagination.options
-        rewards = rollouts.rewards - o.penalty * self.imagination.reward_std * rollouts.uncertainty
-        rewards = rewards / self.reward_scale
+        rewards = (rollouts.rewards - self.penalty(rollouts)) / self.reward_scale
         if o.value_expansion > 0:
             total, end, weight = rollouts.returns(rewards, self.discount)
         else:
