@@ -57,6 +57,7 @@ def learned_value(cls: Any, **options: Any) -> tuple[float, float]:
                 next_observations=torch.randn(rows, S, generator=generator),
                 discounts=torch.full((rows,), 0.5),
                 returns=torch.full((rows,), 2.0),
+                following_observations=torch.randn(rows, S, generator=generator),
             )
         )
         agent.update_index += 1

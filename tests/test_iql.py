@@ -1,5 +1,6 @@
 """Implicit Q-learning by hand: the expectile, the cut weights, targets without actions, and published rewards."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit.agents.iql import IQL, expectile_loss
+from envtf_lit.data.datamodules import TransitionData
+from envtf_lit.data.sources.files import save_dataset
+from tests.analytic import linear_data
 from tests.hand_driven import B, hand_driven, make_batch
 
 A = 2
@@ -84,15 +88,12 @@ def test_the_actors_rate_falls_along_half_a_cosine() -> None:
     assert agent.rate("value", 0.5) == agent.options.critic_learning_rate
 
 
-def test_published_rewards_make_the_logs_returns_span_a_thousand() -> None:
-    agent = make_agent(return_range=1_000.0)
-    transitions = SimpleNamespace(columns={"returns": torch.tensor([0.0, 1.0])})
-    dataset = SimpleNamespace(
-        observation_scale=lambda: (torch.zeros(3), torch.ones(3)), episode_returns=np.array([10.0, 60.0, 30.0])
-    )
-    agent.trainer = SimpleNamespace(datamodule=SimpleNamespace(dataset=dataset, transitions=transitions))
+def test_published_rewards_make_the_logs_returns_span_a_thousand(tmp_path: Path) -> None:
+    save_dataset(linear_data((10, 20, 30)), tmp_path / "log.h5")
+    agent, data = make_agent(return_range=1_000.0), TransitionData(str(tmp_path / "log.h5"))
+    agent.trainer = SimpleNamespace(datamodule=data)
     agent.setup("fit")
-    assert float(agent.return_scale) == pytest.approx(50.0 / 1_000.0)
+    assert np.ptp(data.dataset.episode_returns) / float(agent.return_scale) == pytest.approx(1_000.0)
 
 
 def test_the_warm_start_teaches_value_critics_and_actor_what_the_log_says() -> None:

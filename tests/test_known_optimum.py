@@ -40,6 +40,7 @@ def log_rows(generator: torch.Generator) -> dict[str, Tensor]:
         returns=rewards,
         next_actions=actions,
         followed=torch.zeros(ROWS),
+        following_observations=observations,
     )
 
 

@@ -23,7 +23,7 @@ def test_u_of_an_ensemble_is_the_largest_norm_of_a_members_deviation() -> None:
     model = linear_gaussians(members=4)
     model.elite = model.elite[:2]  # all members count, the elites or not
     agent = mopo_in(source_in(model, penalty=2.0))
-    found = agent.penalty(ROLLOUTS)
+    found = ROLLOUTS.rewards - agent.charged(ROLLOUTS)
     for t, b in ROLLOUTS.valid.nonzero().tolist():
         pair = model.normaliser.token(ROLLOUTS.observations[t, b], ROLLOUTS.actions[t, b])
         _, log_variance = model(pair[None])
@@ -34,7 +34,7 @@ def test_u_of_an_ensemble_is_the_largest_norm_of_a_members_deviation() -> None:
 
 def test_imagined_rewards_pay_that_penalty() -> None:
     agent = mopo_in(source_in(linear_gaussians(), ROLLOUTS, penalty=2.0))
-    expected = (ROLLOUTS.rewards - agent.penalty(ROLLOUTS))[ROLLOUTS.valid]
+    expected = agent.charged(ROLLOUTS)[ROLLOUTS.valid]
     torch.testing.assert_close(agent.source.ring.rewards, expected)
     assert (expected < ROLLOUTS.rewards[ROLLOUTS.valid]).all()
 
@@ -43,7 +43,8 @@ def test_of_another_model_u_is_its_own_in_units_of_the_rewards_deviation() -> No
     source = imagined_batches(penalty=3.0)
     agent = mopo_in(source)
     std = source.imagination.reward_std
-    torch.testing.assert_close(agent.penalty(ROLLOUTS), 3.0 * std * ROLLOUTS.uncertainty)
+    found = ROLLOUTS.rewards - agent.source.imagination.charged(ROLLOUTS)
+    torch.testing.assert_close(found, 3.0 * std * ROLLOUTS.uncertainty)
 
 
 def test_without_a_penalty_it_is_mbpo() -> None:

@@ -34,10 +34,10 @@ class BC(Agent):
     options: BCOptions
 
     def setup(self, stage: str) -> None:
-        super().setup(stage)
         if self.options.best_share < 1:
             data: TransitionData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
             data.chances = best_rows(data.dataset, self.options.best_share)
+        super().setup(stage)
 
     def parts(self) -> dict[str, Part]:
         return dict(actor=Part(self.actor, self.options.actor_learning_rate))

@@ -44,24 +44,21 @@ class MOPO(ModelBased):
 
     def build_networks(self) -> None:
         super().build_networks()
-        self.source.penalty = self.penalty
+        if isinstance(self.source.imagination.model, EnsembleDynamics):  # others have a u of their own
+            self.source.imagination.charged = self.charged
 
-    def penalty(self, rollouts: Rollouts) -> Tensor:
-        """(H, B) `lambda u(s, a)`, u the largest norm of a member's standard deviation (section 4.3).
+    def charged(self, rollouts: Rollouts) -> Tensor:
+        """(H, B) `r - lambda u(s, a)`, u the largest norm of a member's standard deviation (section 4.3).
 
-        The norm is over next state and reward in raw units, the maximum over all members. `Prediction.uncertainty`
-        stands for it in world models that have no members.
+        The norm is over next state and reward in raw units, the maximum over all members.
         """
-        imagination = self.source.imagination
-        model, weight = imagination.model, imagination.options.penalty
-        if not isinstance(model, EnsembleDynamics):
-            return imagination.penalty(rollouts)
-        found = torch.zeros_like(rollouts.rewards)
-        if weight > 0:
-            taken, u = rollouts.valid, []
-            for pairs in zip(
-                rollouts.observations[taken].split(ROWS), rollouts.actions[taken].split(ROWS), strict=True
-            ):
-                u.append(model.largest_deviation(*pairs))
-            found[taken] = weight * torch.cat(u)
-        return found
+        imagination, taken = self.source.imagination, rollouts.valid
+        assert isinstance(imagination.model, EnsembleDynamics)
+        if imagination.options.penalty == 0:
+            return rollouts.rewards
+        pairs = zip(rollouts.observations[taken].split(ROWS), rollouts.actions[taken].split(ROWS), strict=True)
+        with torch.autocast(rollouts.rewards.device.type, enabled=False):
+            u = torch.cat([imagination.model.largest_deviation(*some) for some in pairs])
+        rewards = rollouts.rewards.clone()
+        rewards[taken] -= imagination.options.penalty * u
+        return rewards

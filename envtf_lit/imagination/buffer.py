@@ -1,7 +1,5 @@
 """Batches of real and imagined rows: rollouts of the current policy, the newest kept in a ring."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 
@@ -57,9 +55,10 @@ class Imagination:
             generator=generator,
         )
 
-    def penalty(self, rollouts: Rollouts) -> Tensor:
-        """(H, B) `weight * std(r) * u`: what imagined rewards lose, unless an algorithm says otherwise."""
-        return self.options.penalty * self.reward_std * rollouts.uncertainty
+    def charged(self, rollouts: Rollouts) -> Tensor:
+        """(H, B) rewards less the penalty `weight * std(r) * u`, std(r) over the data; differentiable in the states."""
+        weight = self.options.penalty * self.reward_std
+        return rollouts.rewards - weight * rollouts.uncertainty if weight > 0 else rollouts.rewards
 
 
 class Ring(nn.Module):
@@ -124,7 +123,6 @@ class ImaginedBatches(nn.Module):
         super().__init__()
         self.imagination, self.stored, self.discount = imagination, stored, discount
         self.real_ratio, self.refresh_every = real_ratio, refresh_every
-        self.penalty: Callable[[Rollouts], Tensor] = imagination.penalty  # MOPO has its own
         o = imagination.options
         capacity = ROUNDS_KEPT * o.branches * o.horizon if refresh_every else len(stored)
         self.ring = Ring(stored.observations.shape[-1], stored.actions.shape[-1], max(1, capacity))
@@ -155,9 +153,8 @@ class ImaginedBatches(nn.Module):
 
     def add_rollouts(self, rollouts: Rollouts, *, horizon: int) -> None:
         """Puts the first `horizon` steps into the ring, rewards less the penalty."""
-        o = self.imagination.options
-        rewards = (rollouts.rewards - self.penalty(rollouts)) / self.reward_scale
-        if o.value_expansion > 0:
+        rewards = self.imagination.charged(rollouts) / self.reward_scale
+        if self.imagination.options.value_expansion > 0:
             total, end, weight = rollouts.returns(rewards, self.discount)
         else:
             weight = self.discount * (~rollouts.terminated).float()
