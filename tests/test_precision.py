@@ -25,6 +25,7 @@ def pairs() -> tuple[Tensor, Tensor]:
 
 def raised(network: StackedCritics | StateValue, level: float) -> None:
     """Values about this level, as different among themselves as before."""
+    assert network.out.bias is not None
     with torch.no_grad():
         network.out.bias.add_(level)
 

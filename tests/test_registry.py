@@ -100,7 +100,7 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_toy_is_trained_and_published(experiment: Path) -> None:
     folder = experiment / "models/policy/toy"
     curves = (folder / CURVES).read_text().splitlines()
-    assert curves[0] == "epoch,train/toy_loss" and len(curves) == 3
+    assert curves[0] == "epoch,train/effective_episodes,train/toy_loss" and len(curves) == 3
     assert read_json(folder / "metrics.json")["toy_loss"] > 0
     settings = read_json(folder / "resolved.json")
     assert settings["algorithm"] == "toy" and settings["options"]["pull"] == 2.0

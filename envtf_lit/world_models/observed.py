@@ -1,6 +1,6 @@
 """World models of robots whose velocities are observed clipped: imagined ones stay where data hold them, too."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -21,28 +21,20 @@ def bare(model: WorldModel) -> WorldModel:
     return model.model if isinstance(model, ClippedWorld) else model
 
 
-@dataclass(frozen=True)
 class ClippedWorld:
     """A world model whose next observations are clipped to [-10, 10] from a dimension on (Hopper, Walker2d).
 
     The simulator shows no others, so no state beyond is like any that the model has seen. `Prediction.mean` and
     `log_prob` are of what the model said. A gradient ends where a velocity is clipped, as the observation's does.
 
-    Attributes:
+    Args:
         model: that predicts.
         first: dimension of the first velocity; the rest are velocities, too.
     """
 
-    model: WorldModel
-    first: int
-
-    @property
-    def observation_dim(self) -> int:
-        return self.model.observation_dim
-
-    @property
-    def action_dim(self) -> int:
-        return self.model.action_dim
+    def __init__(self, model: WorldModel, first: int) -> None:
+        self.model, self.first = model, first
+        self.observation_dim, self.action_dim = model.observation_dim, model.action_dim
 
     def init(
         self,
