@@ -41,6 +41,8 @@ def log_rows(generator: torch.Generator) -> dict[str, Tensor]:
         next_actions=actions,
         followed=torch.zeros(ROWS),
         following_observations=observations,
+        last_observations=observations,
+        tails=torch.zeros(ROWS),
     )
 
 
