@@ -1,6 +1,7 @@
 """Every algorithm that there is goes through the pipeline, and is told apart in its figures."""
 
 import re
+import shutil
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -25,12 +26,14 @@ from envtf_lit.pipeline.train_policy import train_policy
 from envtf_lit.pipeline.yaml import dump_params, preset_params
 from envtf_lit.policy import kind_of, load_policy
 from envtf_lit.world_models.store import load_world_model
+from tests.test_training import Killed, bytes_of, kill_in_epoch
 from tests.walker import walker_dataset
 
+SLOW = pytest.mark.slow
 TRANSFORMER = ("et_cql_paper", "et_cql")
 SHORT = {"branches": 8, "horizon": 2}
 OWN: dict[str, dict[str, Any]] = {  # so that each has all its parts in twenty updates
-    "rambo": {"adversarial_every": 5, "adversarial_updates": 2},
+    "rambo": {"warm_start": 0.2, "adversarial_every": 5, "adversarial_updates": 2},
     "et_cql": {
         "rollouts": SHORT | {"value_expansion": 1},
         "value_gradient": {"updates": 5, "rollouts": 4, "horizon": 4},
@@ -51,7 +54,7 @@ def section(name: str) -> dict[str, Any]:
 def params() -> Params:
     """All algorithms side by side, and both world models, in twenty updates each."""
     tree = dump_params(preset_params("tiny"))
-    tree["policy"] |= {"updates": 20, "updates_per_epoch": 20, "batch_size": 16, "hidden": [16, 16]}
+    tree["policy"] |= {"updates": 20, "updates_per_epoch": 10, "batch_size": 16, "hidden": [16, 16]}
     tree["train_policy"] = {name: section(name) for name in ALGORITHMS}
     tree["train_model"]["transformer"] |= {"updates": 10, "updates_per_epoch": 10}
     tree["train_model"]["ensemble"] = dict(
@@ -94,13 +97,30 @@ def test_an_algorithm_is_trained_and_its_policy_acts(name: str, project: tuple[P
         assert all(torch.equal(value, before[key]) for key, value in after.items())
 
 
+@pytest.mark.parametrize("name", ["rambo", *(pytest.param(x, marks=SLOW) for x in ("td3_bc", "iql", "mobile"))])
+def test_a_run_that_was_killed_goes_on_to_the_same_policy(
+    name: str, project: tuple[Params, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the bit: target actors, state values and a world model that learns on are in the checkpoint, too."""
+    params, root = project
+    folder = root / "models/policy" / name
+    train_policy(params, root, name=name, progress=False)
+    whole = bytes_of(folder)
+    shutil.rmtree(folder)
+    with monkeypatch.context() as patch:
+        kill_in_epoch(patch, 1)
+        with pytest.raises(Killed):
+            train_policy(params, root, name=name, progress=False)
+    assert not folder.exists()
+    train_policy(params, root, name=name, progress=False)
+    assert bytes_of(folder) == whole
+
+
 @pytest.mark.slow
 def test_all_are_evaluated_and_reported_side_by_side(
     project: tuple[Params, Path], repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("papermill")
-    import shutil
-
     from tests.reports import said
 
     params, root = project
