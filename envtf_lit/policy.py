@@ -1,10 +1,11 @@
-"""Policies: the protocol that everything acting follows, and the squashed Gaussian actor that all of ours are."""
+"""Policies: the protocol that everything acting follows, and the actors that ours are: one class a kind."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Any, ClassVar, Protocol, TypedDict, Unpack, cast
 
 import torch
 from torch import Tensor, nn
@@ -44,11 +45,33 @@ def in_fp32(layer: nn.Module, x: Tensor) -> Tensor:
         return layer(x.float())
 
 
-class TanhGaussianActor(nn.Module):
-    """`a = tanh(x), x ~ N(mean(s), std(s))`, scaled to the action space (Haarnoja et al. 2018, appendix C).
+class Sizes(TypedDict, total=False):
+    """What the constructors of all kinds of actors take by name; see `Actor`."""
+
+    hidden: Sequence[int]
+    layer_norm: bool
+    action_low: Sequence[float] | None
+    action_high: Sequence[float] | None
+
+
+class Actor(nn.Module, ABC):
+    """A network from observations to actions: what the kinds of actors share.
 
     Observations are z-scored by buffers inside the module, so that a saved actor needs nothing beside it.
+
+    Args:
+        observation_dim: S.
+        action_dim: A.
+        hidden: units of each hidden layer.
+        layer_norm: LayerNorm before each ReLU.
+        action_low, action_high: (A,), None for [-1, 1].
+
+    Attributes:
+        heads: numbers that the network gives for each action dimension.
+        arguments: the constructor's, to build the module again.
     """
+
+    heads: ClassVar[int] = 1
 
     observation_mean: Tensor
     observation_std: Tensor
@@ -62,22 +85,19 @@ class TanhGaussianActor(nn.Module):
         *,
         hidden: Sequence[int] = (256, 256),
         layer_norm: bool = False,
-        log_std_min: float = LOG_STD_MIN,
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
-        self.arguments = dict(
+        self.arguments: dict[str, Any] = dict(
             observation_dim=observation_dim,
             action_dim=action_dim,
             hidden=list(hidden),
             layer_norm=layer_norm,
-            log_std_min=log_std_min,
             action_low=list(action_low) if action_low is not None else None,
             action_high=list(action_high) if action_high is not None else None,
         )
-        self.net = mlp([observation_dim, *hidden, 2 * action_dim], layer_norm=layer_norm)
-        self.log_std_min = log_std_min
+        self.net = mlp([observation_dim, *hidden, self.heads * action_dim], layer_norm=layer_norm)
         self.register_buffer("observation_mean", torch.zeros(observation_dim))
         self.register_buffer("observation_std", torch.ones(observation_dim))
         low = -1.0 if action_low is None else torch.as_tensor(action_low, dtype=torch.float32)
@@ -86,7 +106,7 @@ class TanhGaussianActor(nn.Module):
         self.register_buffer("action_high", torch.zeros(action_dim) + high)
 
     @torch.no_grad()
-    def start_from(self, other: "TanhGaussianActor") -> None:
+    def start_from(self, other: "Actor") -> None:
         """Takes over another actor's layers; this one keeps its scales, which are those of its own data.
 
         The hidden layers must be alike. A first layer for observations of the same size is taken over too, rescaled so
@@ -94,10 +114,14 @@ class TanhGaussianActor(nn.Module):
         range. Others begin anew.
 
         Raises:
-            UserError: the hidden layers differ.
+            UserError: the actors are of two kinds, or the hidden layers differ.
         """
-        for name in ("hidden", "layer_norm", "log_std_min"):
-            mine, theirs = self.arguments[name], other.arguments[name]
+        if type(other) is not type(self):
+            raise UserError(f"it is a {kind_of(other)} actor, and this one is {kind_of(self)}: start from one like it.")
+        for name, mine in self.arguments.items():
+            if name in ("observation_dim", "action_dim", "action_low", "action_high"):
+                continue
+            theirs = other.arguments[name]
             if mine != theirs:
                 raise UserError(f"{name} is {theirs} there and {mine} here; leave it as it is there.")
         first, last = cast(nn.Linear, self.net[0]), self.net[-1]
@@ -110,17 +134,45 @@ class TanhGaussianActor(nn.Module):
             first.weight.copy_(theirs.weight * (self.observation_std / other.observation_std))
             first.bias.copy_(theirs.bias + theirs.weight @ shift)
 
-    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Observation (..., S) to the mean and log standard deviation, each (..., A), before the tanh."""
+    def outputs(self, observation: Tensor) -> Tensor:
+        """Observations (..., S) to what the network says of them (..., heads * A), in fp32."""
         x = (observation - self.observation_mean) / self.observation_std
         *hidden, last = self.net
         for layer in hidden:
             x = layer(x)
-        mean, log_std = in_fp32(last, x).chunk(2, dim=-1)
-        return mean, log_std.clamp(self.log_std_min, LOG_STD_MAX)
+        return in_fp32(last, x)
+
+    @abstractmethod
+    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
+        """As of `Policy`, without gradient."""
+
+    @abstractmethod
+    def clone_error(self, observation: Tensor, action: Tensor) -> Tensor:
+        """(B,) how far the actor is from given actions, per action dimension: what cloning makes small."""
 
     def _scale(self, squashed: Tensor) -> Tensor:
         return self.action_low + 0.5 * (squashed + 1.0) * (self.action_high - self.action_low)
+
+    def squashed(self, action: Tensor) -> Tensor:
+        """The inverse of the last scaling: actions (..., A) as shares of the range, from -1 to 1."""
+        return 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0
+
+
+class TanhGaussianActor(Actor):
+    """`a = tanh(x), x ~ N(mean(s), std(s))`, scaled to the action space (Haarnoja et al. 2018, appendix C)."""
+
+    heads = 2
+
+    def __init__(
+        self, observation_dim: int, action_dim: int, *, log_std_min: float = LOG_STD_MIN, **others: Unpack[Sizes]
+    ) -> None:
+        super().__init__(observation_dim, action_dim, **others)
+        self.arguments["log_std_min"] = self.log_std_min = log_std_min
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Observation (..., S) to the mean and log standard deviation, each (..., A), before the tanh."""
+        mean, log_std = self.outputs(observation).chunk(2, dim=-1)
+        return mean, log_std.clamp(self.log_std_min, LOG_STD_MAX)
 
     def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
         """Observations (B, S) to actions (B, A): tanh of the mean, or of a sample drawn with `generator`."""
@@ -157,12 +209,74 @@ class TanhGaussianActor(nn.Module):
         that is squashed beyond it (a censored Gaussian: Tobin 1958), at most zero.
         """
         mean, log_std = self(observation)
-        squashed = 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0
+        squashed = self.squashed(action)
         raw = torch.atanh(squashed.clamp(-BOUND, BOUND))
         scaled = (raw - mean) * torch.exp(-log_std)
         inside = -0.5 * scaled.square() - log_std - 0.5 * math.log(2 * math.pi) - _log_tanh_slope(raw)
         beyond = torch.special.log_ndtr(-scaled * squashed.sign())
         return torch.where(squashed.abs() < BOUND, inside, beyond).sum(-1)
+
+    def clone_error(self, observation: Tensor, action: Tensor) -> Tensor:
+        """(B,) `-log pi(a|s) / A`."""
+        return -self.log_prob(observation, action) / action.shape[-1]
+
+
+class GaussianActor(Actor):
+    """`u ~ N(tanh(x(s)), std)`, scaled to the action space: a mean within it, one spread for all states, no squashing.
+
+    The policy of IQL (Kostrikov et al. 2021), whose log-density stays bounded where recorded actions lie at their
+    limits; a squashed Gaussian's has no bound there.
+    """
+
+    def __init__(self, observation_dim: int, action_dim: int, **others: Unpack[Sizes]) -> None:
+        super().__init__(observation_dim, action_dim, **others)
+        self.log_std = nn.Parameter(torch.zeros(action_dim))
+
+    @torch.no_grad()
+    def start_from(self, other: Actor) -> None:
+        """As of `Actor`; the spread too, for actions of the same size."""
+        super().start_from(other)
+        if isinstance(other, GaussianActor) and self.log_std.shape == other.log_std.shape:
+            self.log_std.copy_(other.log_std)
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Observation (..., S) to the mean (..., A) and log standard deviation (A,), in shares of the range."""
+        return torch.tanh(self.outputs(observation)), self.log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
+
+    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
+        """Observations (B, S) to actions (B, A): the mean, or a sample drawn with `generator`, cut at the limits."""
+        with torch.no_grad():
+            mean, log_std = self(observation)
+            if not deterministic:
+                mean = (mean + log_std.exp() * _normal(mean, generator)).clamp(-1.0, 1.0)
+            return self._scale(mean)
+
+    def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Log-density of given actions: observation (B, S), action (B, A) to (B,), per unit of shares of the range."""
+        mean, log_std = self(observation)
+        scaled = (self.squashed(action) - mean) * torch.exp(-log_std)
+        return (-0.5 * scaled.square() - log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
+
+    def clone_error(self, observation: Tensor, action: Tensor) -> Tensor:
+        """(B,) `-log pi(a|s) / A`."""
+        return -self.log_prob(observation, action) / action.shape[-1]
+
+
+class DeterministicActor(Actor):
+    """`a = tanh(x(s))`, scaled to the action space: the policy of TD3 and its kin (Fujimoto et al. 2018)."""
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Observations (..., S) to actions (..., A) in the environment's own range."""
+        return self._scale(torch.tanh(self.outputs(observation)))
+
+    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
+        """Observations (B, S) to actions (B, A); `deterministic` changes nothing: there is nothing to draw."""
+        with torch.no_grad():
+            return self(observation)
+
+    def clone_error(self, observation: Tensor, action: Tensor) -> Tensor:
+        """(B,) squared distance in shares of the range, mean over action dimensions."""
+        return (self.squashed(self(observation)) - self.squashed(action)).square().mean(-1)
 
 
 def _normal(like: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -187,15 +301,24 @@ class RandomPolicy:
         return self.action_low + uniform * (self.action_high - self.action_low)
 
 
-POLICIES = {"tanh_gaussian": TanhGaussianActor}
+POLICIES: dict[str, type[Actor]] = {
+    "tanh_gaussian": TanhGaussianActor,
+    "gaussian": GaussianActor,
+    "deterministic": DeterministicActor,
+}
 
 
-def save_policy(folder: str | Path, actor: TanhGaussianActor) -> None:
-    """Writes an actor as safetensors beside JSON."""
-    save_module(folder, actor, kind="tanh_gaussian", arguments=actor.arguments)
+def kind_of(actor: Actor) -> str:
+    """The name of an actor's kind, in the registry of all."""
+    return next(name for name, cls in POLICIES.items() if cls is type(actor))
 
 
-def load_policy(folder: str | Path) -> TanhGaussianActor:
+def save_policy(folder: str | Path, actor: Actor) -> None:
+    """Writes an actor as safetensors beside JSON, which names its kind."""
+    save_module(folder, actor, kind=kind_of(actor), arguments=actor.arguments)
+
+
+def load_policy(folder: str | Path) -> Actor:
     """The policy saved in a folder, ready to `act`.
 
     Raises:

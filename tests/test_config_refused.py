@@ -80,7 +80,10 @@ REFUSED = {
         "horizon is 3",
         "history is 4",
     ],
-    f"train_policy: {{{BC}, x: {{algorithm: combo, rollouts: {{history: 16}}}}}}": ["history is 16", "at most 15"],
+    f"train_policy: {{{BC}, x: {{algorithm: combo, world_model: transformer, rollouts: {{history: 16}}}}}}": [
+        "history is 16",
+        "at most 15",
+    ],
     "train_policy: {cql: {algorithm: cql}}": ["'bc' below train_policy"],
     "generate_rollouts: {policy: et_cql}": ["generate_rollouts.policy is et_cql", "such as bc"],
     "generate_rollouts: {policy: bcc}": ["'bcc' below train_policy", "did you mean"],

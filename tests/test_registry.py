@@ -146,7 +146,7 @@ def test_an_unknown_option_of_the_toy_is_refused_with_the_nearest_one() -> None:
 
 def test_params_yaml_writes_and_reads_the_toy(tmp_path: Path) -> None:
     text = params_yaml(tiny())
-    assert "algorithm: toy  # bc | cql | combo | et_cql_paper | et_cql | toy\n" in text
+    assert f"algorithm: toy  # {' | '.join(registry.ALGORITHMS)}\n" in text
     assert "pull: 2.0  # weight of the squared distance to the recorded actions\n" in text
     (tmp_path / "params.yaml").write_text(text)
     assert load_params(tmp_path / "params.yaml") == tiny()

@@ -18,7 +18,7 @@ from envtf_lit.data.loaders import epoch_generator
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.buffer import ImaginedBatches
 from envtf_lit.options.schema import build
-from envtf_lit.policy import TanhGaussianActor, load_policy
+from envtf_lit.policy import Actor, TanhGaussianActor, load_policy
 
 Batch = dict[str, Tensor]
 Logs = dict[str, Tensor]
@@ -91,6 +91,7 @@ class Agent(L.LightningModule, ABC):
         label: its name in figures and tables.
         imagines: whether it learns from a world model, too.
         cures: what helps most against divergence, by the logged name; see `divergence.check_means`.
+        actor_kind: of its policy.
 
     Args:
         observation_dim: S.
@@ -110,8 +111,10 @@ class Agent(L.LightningModule, ABC):
     label: ClassVar[str]
     imagines: ClassVar[bool] = False
     cures: ClassVar[Mapping[str, str]] = {"": "lower actor_learning_rate, or look for outliers with `envtf data check`"}
+    actor_kind: ClassVar[type[Actor]] = TanhGaussianActor
 
     options: PolicyOptions
+    actor: Actor
     return_scale: Tensor
     started: Tensor
 
@@ -153,7 +156,7 @@ class Agent(L.LightningModule, ABC):
         self.automatic_optimization = False
         self.observation_dim, self.action_dim = observation_dim, action_dim
         self.seed, self.source, self.init_from = seed, source, init_from
-        self.actor = TanhGaussianActor(
+        self.actor = self.actor_kind(
             observation_dim, action_dim, hidden=self.options.hidden, action_low=action_low, action_high=action_high
         )
         self.build_networks()
@@ -237,9 +240,9 @@ class Agent(L.LightningModule, ABC):
         return last.update(self, batch, last.updates - 1)  # asked for more than planned
 
     def clone_loss(self, batch: Batch) -> Tensor:
-        """`-log pi(a|s) / A`, mean over the real rows; per action dimension, so that it holds every robot alike."""
-        log_density = self.actor.log_prob(batch["observations"], batch["actions"])
-        return -(batch["real"] * log_density).sum() / (batch["real"].sum() * self.action_dim)
+        """The actor's distance from the recorded actions (`Actor.clone_error`), mean over the real rows."""
+        error = self.actor.clone_error(batch["observations"], batch["actions"])
+        return (batch["real"] * error).sum() / batch["real"].sum()
 
     # Lightning hooks
 

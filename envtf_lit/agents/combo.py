@@ -6,9 +6,11 @@ from typing import ClassVar, Self
 from torch import Tensor
 
 from envtf_lit.agents.cql import CQL, CQLOptions
+from envtf_lit.agents.model_based import BranchedRolloutOptions
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.imagination.options import RolloutOptions
-from envtf_lit.options.numbers import Natural, NonzeroShare
+from envtf_lit.options.numbers import Count, Natural, NonNegative, NonzeroShare
+from envtf_lit.options.schema import rare
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,27 @@ class ImaginingOptions(CQLOptions):
         return replace(self, rollouts=replace(o, value_expansion=expansion))
 
 
-class COMBO(CQL):
-    """Conservative Q-Learning on a mixture of real and imagined rows, in COMBO's form."""
+@dataclass(frozen=True)
+class COMBOOptions(ImaginingOptions):
+    """COMBO's published settings: in the ensemble, half of each batch real, each imagined step a row of its own.
 
-    Options: ClassVar[type[PolicyOptions]] = ImaginingOptions
+    With `world_model: transformer` it is the Environment Transformer's COMBO: an option, not another algorithm.
+    """
+
+    world_model: str = "ensemble"
+    cql_weight: NonNegative = 5.0
+    sampled_actions: Count = rare(10)
+    clone_weight: NonNegative = 0.0
+
+    real_ratio: NonzeroShare = 0.5
+    refresh_every: Natural = 1_000
+    rollouts: BranchedRolloutOptions = field(default_factory=BranchedRolloutOptions)
+
+
+class COMBO(CQL):
+    """Conservative Q-Learning on a mixture of real and imagined rows, in COMBO's form, in any world model."""
+
+    Options: ClassVar[type[PolicyOptions]] = COMBOOptions
     label = "COMBO"
     imagines = True
     options: ImaginingOptions

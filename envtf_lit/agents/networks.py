@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from envtf_lit.policy import in_fp32
+from envtf_lit.policy import in_fp32, mlp
 
 
 class StackedLinear(nn.Module):
@@ -70,6 +70,27 @@ class StackedCritics(nn.Module):
         if self.layer_norm:  # without gain and shift: a rectifier follows, so no later layer could make up for a shift
             x = F.layer_norm(x, x.shape[-1:])
         return F.relu(x)
+
+
+class PlainStateValue(nn.Module):
+    """`V(s)`, an MLP with ReLU and, if wanted, LayerNorm, as the critics are: no actor follows its gradient."""
+
+    observation_mean: Tensor
+    observation_std: Tensor
+
+    def __init__(self, observation_dim: int, *, hidden: Sequence[int], layer_norm: bool) -> None:
+        super().__init__()
+        self.net = mlp([observation_dim, *hidden, 1], layer_norm=layer_norm)
+        self.register_buffer("observation_mean", torch.zeros(observation_dim))
+        self.register_buffer("observation_std", torch.ones(observation_dim))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Observations (B, S) to (B,), fp32."""
+        x = (observation - self.observation_mean) / self.observation_std
+        *layers, last = self.net
+        for layer in layers:
+            x = layer(x)
+        return in_fp32(last, x)[..., 0]
 
 
 class StateValue(nn.Module):

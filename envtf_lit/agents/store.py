@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from envtf_lit.files import replacing
-from envtf_lit.policy import TanhGaussianActor, save_policy
+from envtf_lit.policy import Actor, save_policy
 from envtf_lit.training import Curves, record_training
 
 
 def publish_policy(
-    target: Path, actor: TanhGaussianActor, curves: Curves, kept: Mapping[str, float], settings: dict[str, Any]
+    target: Path, actor: Actor, curves: Curves, kept: Mapping[str, float], settings: dict[str, Any]
 ) -> dict[str, Any]:
     """Writes a policy's folder.
 

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from envtf_lit.agents.actor_critic import held_fixed
 from envtf_lit.agents.agent import Agent, Batch, Logs, Phase, follow
 from envtf_lit.agents.networks import StateValue
-from envtf_lit.agents.sac import held_fixed
 from envtf_lit.imagination.buffer import Imagination
 from envtf_lit.imagination.histories import Histories
 from envtf_lit.imagination.rollouts import Rollouts, gather_steps, lost
@@ -259,6 +259,7 @@ class ValueGradient(Phase):
         """One step of the actor along the gradient, and several of the state value."""
         values, discount = self.values, agent.options.discount
         log = Returns(agent.typical_return / agent.return_scale, agent.return_spread / agent.return_scale)
+        assert isinstance(agent.actor, TanhGaussianActor)
         paths = self.paths.next(agent.actor, agent.return_scale, agent.generator)
         with held_fixed(values.value):
             imagined = values.imagined_return(paths, discount, log).mean()

@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 from envtf_lit.cli.output import console
 from envtf_lit.cli.signatures import Folder, run_command
+from envtf_lit.errors import UserError
 
 
 def init(folder: Folder, /, *, preset: str = "small") -> None:
@@ -24,15 +25,21 @@ def init(folder: Folder, /, *, preset: str = "small") -> None:
     console().print(f"Wrote a project to {folder}. Next: {first}cd {folder} && dvc repro")
 
 
-def params(*, preset: str = "small") -> None:
+def params(*, preset: str = "small", algorithm: str | None = None, task: str | None = None) -> None:
     """Prints a complete params.yaml.
 
     Args:
         preset: tiny, small, base or paper.
+        algorithm: trained with its published settings, such as mopo.
+        task: whose settings of that algorithm, such as hopper-medium; the preset's if not given.
     """
+    from envtf_lit.pipeline.published import published_params
     from envtf_lit.pipeline.yaml import params_yaml, preset_params
 
-    sys.stdout.write(params_yaml(preset_params(preset)))
+    if algorithm is None and task is not None:
+        raise UserError(f"--task {task} says whose published settings are meant: say of which --algorithm, too.")
+    found = preset_params(preset) if algorithm is None else published_params(algorithm, task, preset)
+    sys.stdout.write(params_yaml(found))
 
 
 def doctor() -> None:

@@ -112,6 +112,9 @@ class WindowData(L.LightningDataModule):
 class TransitionData(L.LightningDataModule):
     """Transitions for agents, several batches at a time.
 
+    Attributes:
+        chances: (N,) of each row, beside those of `return_weights`; None for equal ones. An agent may set them.
+
     Args:
         path: dataset file, HDF5 or NPZ.
         batch_size: rows per gradient step and process.
@@ -124,6 +127,8 @@ class TransitionData(L.LightningDataModule):
             them, the ones that `WindowData` holds out with the same share and seed.
         seed: of all draws, and of that split.
     """
+
+    chances: Tensor | None
 
     def __init__(
         self,
@@ -141,6 +146,7 @@ class TransitionData(L.LightningDataModule):
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
         self.discount, self.n_step, self.seed = discount, n_step, seed
         self.return_temperature, self.fewest_episodes = return_temperature, fewest_episodes
+        self.chances = None
         whole = self.read(path)
         self.dataset = whole.split(held_out, seed=seed)[0] if held_out > 0 else whole
         self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
@@ -158,8 +164,10 @@ class TransitionData(L.LightningDataModule):
     @cached_property
     def weights(self) -> Tensor | None:
         """(N,) chances of each row, up to a factor; None where they are equal."""
-        temperature = self.return_temperature
-        return None if temperature is None else return_weights(self.dataset, temperature, self.fewest_episodes)
+        if self.return_temperature is None:
+            return self.chances
+        weights = return_weights(self.dataset, self.return_temperature, self.fewest_episodes)
+        return weights if self.chances is None else weights * self.chances
 
     @cached_property
     def effective_episodes(self) -> float:

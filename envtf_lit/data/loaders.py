@@ -5,6 +5,7 @@ it. The batches are the same to the bit. Every epoch draws from a generator seed
 an epoch's start sees the same rows as one that was never interrupted.
 """
 
+import copy
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -144,6 +145,12 @@ class Store:
         resident = _fits(sum(column.nbytes for column in columns.values()), self.device)
         self.columns = {name: _place(column, self.device, resident) for name, column in columns.items()}
 
+    def only(self, *names: str) -> "Store":
+        """The same columns, in the same place, but no others."""
+        store = copy.copy(self)
+        store.columns = {name: self.columns[name] for name in names}
+        return store
+
     def __getitem__(self, rows: Tensor) -> dict[str, Tensor]:
         """Row numbers (...) on any device to each column's rows (..., D) on the store's."""
         return {name: self._gather(column, rows) for name, column in self.columns.items()}
@@ -234,9 +241,10 @@ class Transitions(Dataset[dict[str, Tensor]]):
 
     Columns: `observations`, `actions`, `rewards` (discounted sum over the n steps, or as many as the episode has
     left), `next_observations` (where those steps end), `discounts` (`discount ** steps`, zero if the task terminated
-    there: what the value of `next_observations` counts for), `following_observations` (after one step alone); `returns`
-    (discounted sum over all steps that the episode has left), `last_observations` (where it ends) and `tails` (what the
-    value there counts for, likewise: a return that the log cut short is `returns + tails * V(last_observations)`).
+    there: what the value of `next_observations` counts for), `next_actions` (recorded there) and `followed` (whether
+    any was: 0 where the episode ends); `following_observations` (after one step alone); `returns` (discounted sum over
+    all steps that the episode has left), `last_observations` (where it ends) and `tails` (what the value there counts
+    for, likewise: a return that the log cut short is `returns + tails * V(last_observations)`).
 
     Attributes:
         typical_return: mean discounted return of the rows, `mean(returns) / (1 - mean(tails))`: that for which
@@ -256,11 +264,13 @@ class Transitions(Dataset[dict[str, Tensor]]):
         returns = dataset.returns_to_go(discount)
         self.typical_return = float(returns.mean(dtype=np.float64) / (1.0 - tails.mean()))
         self.states = Store(dataset, ("observations", "actions"), device)
+        self.actions = self.states.only("actions")
         self.following = Store(dataset, ("next_observations",), device)
-        columns = dict(rewards=rewards, discounts=discounts, returns=returns, tails=tails)
+        columns = dict(rewards=rewards, discounts=discounts, returns=returns, tails=tails, followed=end < last)
         self.columns = {name: torch.as_tensor(column).float().to(device) for name, column in columns.items()}
-        # (N,) the rows in which the n steps of each row end, and its episode
+        # (N,) the rows in which the n steps of each row end, and its episode; and the row behind the n steps
         self.end, self.last = torch.as_tensor(end, device=device), torch.as_tensor(last, device=device)
+        self.after = torch.minimum(self.end + 1, self.last)
 
     def __len__(self) -> int:
         return len(self.end)
@@ -269,6 +279,7 @@ class Transitions(Dataset[dict[str, Tensor]]):
         rows = rows.to(self.end.device)
         ends = dict(next_observations=self.end[rows], following_observations=rows, last_observations=self.last[rows])
         following = {name: self.following[row]["next_observations"] for name, row in ends.items()}
+        following["next_actions"] = self.actions[self.after[rows]]["actions"]
         return self.states[rows] | following | {name: column[rows] for name, column in self.columns.items()}
 
     def complete_returns(self) -> Tensor:

@@ -30,6 +30,12 @@ TITLES = {
     "value_loss": "state value loss",
     "entropy": "entropy of the policy (nats)",
     "alpha": "temperature alpha",
+    "weight": "weight of a cloned row",
+    "model_loss": "world model's own loss",
+    "adversarial_loss": "world model's adversarial loss",
+    "value": "state value",
+    "warm_value_loss": "state value loss, warm start",
+    "weighted_clone_loss": "weighted -log density of real actions",
 }
 MOST_PANELS = 12
 

@@ -38,7 +38,10 @@ LABELS = {
     "ensemble": "ensemble",
 }
 # of policies, in the order of params.yaml; none is that of imagination, which stands beside them
-POLICY_COLOURS = ("#E69F00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#8C564B", "#F0E442")
+POLICY_COLOURS = (
+    *("#E69F00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#8C564B", "#F0E442"),
+    *("#000075", "#F032E6", "#66A61E", "#E6007E", "#222222", "#800000", "#DCBEFF"),  # far from those, and each other
+)
 # of models that have no colour of their own: each colour with the first line style and marker, then with the next
 SPARE = ("#CC79A7", "#E69F00", "#F0E442", "#009E73")
 LINES = (("-", "o"), ("--", "s"), ("-.", "^"), ((0, (1, 1)), "D"))

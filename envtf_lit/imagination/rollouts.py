@@ -8,7 +8,7 @@ from torch import Tensor
 
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.histories import Histories
-from envtf_lit.policy import Policy, TanhGaussianActor
+from envtf_lit.policy import Actor, Policy
 from envtf_lit.world_models.interface import Mode, Prediction, WorldModel
 from envtf_lit.world_models.unroll import Step, unroll
 
@@ -79,7 +79,7 @@ def _padded(column: Tensor, length: int) -> Tensor:
 class NoisyPolicy:
     """A policy's sampled actions with Gaussian noise of a `scale` in units of half the action range, clipped to it."""
 
-    def __init__(self, actor: TanhGaussianActor, scale: float) -> None:
+    def __init__(self, actor: Actor, scale: float) -> None:
         self.actor, self.scale = actor, scale
 
     def act(self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None) -> Tensor:

@@ -200,7 +200,9 @@ def _named_lines(stage: str, name: str, values: Mapping[str, Any], explained: se
     """A named section: its tag with the choices, then its options."""
     tag, choices = NAMED[stage], KINDS if stage == "train_model" else ALGORITHMS
     yield f"  {name}:"
-    yield f"    {tag}: {values[tag]}  # {' | '.join(choices)}"
+    line, meaning = f"    {tag}: {values[tag]}", " | ".join(choices)
+    yield line if meaning in explained else f"{line}  # {meaning}"
+    explained.add(meaning)
     rest = {key: value for key, value in values.items() if key != tag}
     yield from _yaml_lines(_section(None, name, values, stage), rest, 2, explained)
 

@@ -227,6 +227,15 @@ class EnsembleDynamics(nn.Module):
             value = value + torch.exp(0.5 * log_variances[drawn, rows]) * noise
         return value
 
+    @torch.no_grad()
+    def largest_deviation(self, observation: Tensor, action: Tensor) -> Tensor:
+        """MOPO's u: (N, S) and (N, A) to (N,), the largest norm of any member's standard deviation, in raw units.
+
+        Of next state and reward; of all members, the elites or not (Yu et al. 2020, section 4.3).
+        """
+        _, log_variances = self(self.normaliser.token(observation, action))  # (M, N, S + 1)
+        return (torch.exp(0.5 * log_variances) * self.normaliser.target_std).norm(dim=-1).amax(0)
+
     def fuse(self) -> None:
         """Lets `step` run through torch.compile from now on."""
         self.step = torch.compile(self.step, dynamic=True)  # the number of rows changes

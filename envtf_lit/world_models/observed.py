@@ -16,6 +16,11 @@ def as_observed(model: WorldModel, robot: Robot | None) -> WorldModel:
     return model if first is None else ClippedWorld(model, first)
 
 
+def bare(model: WorldModel) -> WorldModel:
+    """The model that predicts, without the clipping of `as_observed`."""
+    return model.model if isinstance(model, ClippedWorld) else model
+
+
 class ClippedWorld:
     """A world model whose next observations are clipped to [-10, 10] from a dimension on (Hopper, Walker2d).
 

@@ -1,0 +1,71 @@
+"""Advantage-weighted cloning (MARWIL, Wang et al. 2018; AWR, Peng et al. 2019): better actions are cloned more."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from envtf_lit.agents.agent import Agent, Batch, Logs, Part
+from envtf_lit.agents.networks import PlainStateValue
+from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.options.numbers import NonNegative
+
+LARGEST_WEIGHT = 20.0  # of a row, as AWR has it
+
+
+@dataclass(frozen=True)
+class WBCOptions(PolicyOptions):
+    """Advantage-weighted cloning's own option.
+
+    Attributes:
+        beta: by which advantages, in units of their root mean square, are multiplied in the weights exp(beta A); 0
+            clones all rows alike.
+    """
+
+    beta: NonNegative = 1.0
+
+
+class WBC(Agent):
+    """Clones the log, each row with a weight that says how much better it went on than its state's value."""
+
+    Options: ClassVar[type[PolicyOptions]] = WBCOptions
+    label = "Weighted BC"
+    options: WBCOptions
+
+    def build_networks(self) -> None:
+        o = self.options
+        self.value = PlainStateValue(self.observation_dim, hidden=o.hidden, layer_norm=o.layer_norm)
+
+    def parts(self) -> dict[str, Part]:
+        o = self.options
+        return dict(value=Part(self.value, o.critic_learning_rate), actor=Part(self.actor, o.actor_learning_rate))
+
+    def losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
+        batch = self.complete_returns(batch)
+        loss = self.value_loss(batch)
+        yield "value", loss, dict(value_loss=loss)
+        yield "actor", *self.actor_loss(batch)
+
+    @torch.no_grad()
+    def complete_returns(self, batch: Batch) -> Batch:
+        """`G + gamma^n V(s_T)` for episodes that were cut after n steps, in s_T; what terminated keeps its return."""
+        return batch | {"returns": batch["returns"] + batch["tails"] * self.value(batch["last_observations"])}
+
+    def value_loss(self, batch: Batch) -> Tensor:
+        """`(V(s) - G)^2`, G the Monte-Carlo return that was recorded (AWR, equation 3)."""
+        return (self.value(batch["observations"]) - batch["returns"]).square().mean()
+
+    def actor_loss(self, batch: Batch) -> tuple[Tensor, Logs]:
+        """`-min(exp(beta (G - V(s)) / c), 20) log pi(a|s)`, c the advantages' root mean square (MARWIL, section 4.2).
+
+        The scale of rewards does not matter; c is that of the batch, where MARWIL has a moving mean.
+        """
+        with torch.no_grad():
+            advantage = batch["returns"] - self.value(batch["observations"])
+            scale = advantage.square().mean().sqrt().clamp(min=1e-6)
+            weight = torch.exp(self.options.beta * advantage / scale).clamp(max=LARGEST_WEIGHT)
+        error = self.actor.clone_error(batch["observations"], batch["actions"])
+        loss = (weight * error).mean()
+        return loss, dict(clone_loss=error.mean(), weighted_clone_loss=loss, weight=weight.mean())

@@ -1,0 +1,106 @@
+"""The kinds of actors: what they do, what they are on disk, and what starts from what."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from envtf_lit.errors import UserError
+from envtf_lit.policy import (
+    POLICIES,
+    Actor,
+    DeterministicActor,
+    GaussianActor,
+    TanhGaussianActor,
+    load_policy,
+    save_policy,
+)
+
+S, A, B = 3, 2, 6
+LIMITS: dict[str, Any] = dict(action_low=[-2.0, 0.0], action_high=[2.0, 0.5])
+KINDS = pytest.mark.parametrize("cls", list(POLICIES.values()))
+
+
+def make_actor(cls: type[Actor], seed: int = 0, **limits: Any) -> Any:
+    torch.manual_seed(seed)
+    actor: Any = cls(S, A, hidden=(16, 16), **limits)
+    actor.observation_mean.copy_(torch.randn(S))
+    return actor
+
+
+@KINDS
+def test_every_kind_is_saved_with_its_name_and_acts_as_it_did(cls: type[Actor], tmp_path: Path) -> None:
+    actor, observation = make_actor(cls, **LIMITS), torch.randn(B, S)
+    save_policy(tmp_path / "policy", actor)
+    again = load_policy(tmp_path / "policy")
+    kind = json.loads((tmp_path / "policy/config.json").read_text())["kind"]
+    assert POLICIES[kind] is cls is type(again)
+    assert torch.equal(again.act(observation), actor.act(observation))
+
+
+def test_a_folder_of_before_there_were_kinds_is_read_as_ever(tmp_path: Path) -> None:
+    """It names `tanh_gaussian`, and arguments in that order."""
+    actor = make_actor(TanhGaussianActor)
+    save_policy(tmp_path / "policy", actor)
+    config = tmp_path / "policy/config.json"
+    arguments = dict(observation_dim=S, action_dim=A, hidden=[16, 16], layer_norm=False, log_std_min=-5.0)
+    config.write_text(
+        json.dumps({"kind": "tanh_gaussian", "arguments": {**arguments, "action_low": None, "action_high": None}})
+    )
+    assert torch.equal(load_policy(tmp_path / "policy").act(torch.ones(1, S)), actor.act(torch.ones(1, S)))
+
+
+@pytest.mark.parametrize("name", ["log_std_min", "width"])
+def test_arguments_that_a_kind_does_not_know_are_refused(name: str, tmp_path: Path) -> None:
+    save_policy(tmp_path / "policy", make_actor(DeterministicActor))
+    config = tmp_path / "policy/config.json"
+    tree = json.loads(config.read_text())
+    tree["arguments"][name] = 1.0
+    config.write_text(json.dumps(tree))
+    with pytest.raises(UserError, match="does not describe a deterministic"):
+        load_policy(tmp_path / "policy")
+
+
+@KINDS
+def test_actions_stay_within_their_limits(cls: type[Actor]) -> None:
+    actor, generator = make_actor(cls, **LIMITS), torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        actor.net[-1].bias += 3.0
+    drawn = actor.act(10 * torch.randn(500, S), deterministic=False, generator=generator)
+    low, high = torch.tensor(LIMITS["action_low"]), torch.tensor(LIMITS["action_high"])
+    assert (drawn >= low - 1e-6).all() and (drawn <= high + 1e-6).all()
+
+
+@KINDS
+def test_an_actor_starts_from_one_of_its_kind_alone(cls: type[Actor]) -> None:
+    base, mine, observation = make_actor(cls, 0), make_actor(cls, 1), torch.randn(B, S)
+    mine.start_from(base)
+    torch.testing.assert_close(mine.act(observation), base.act(observation), rtol=1e-4, atol=1e-5)
+    other = next(kind for kind in POLICIES.values() if kind is not cls)
+    with pytest.raises(UserError, match="start from one like it"):
+        mine.start_from(make_actor(other))
+
+
+def test_the_gaussian_s_density_is_a_normal_one_around_a_squashed_mean() -> None:
+    actor, observation = make_actor(GaussianActor), torch.randn(B, S)
+    with torch.no_grad():
+        actor.log_std.copy_(torch.tensor([-1.0, 0.5]))
+    action = torch.rand(B, A) * 2 - 1
+    expected = torch.distributions.Normal(actor.act(observation), torch.tensor([-1.0, 0.5]).exp())
+    torch.testing.assert_close(actor.log_prob(observation, action), expected.log_prob(action).sum(-1))
+
+
+def test_the_gaussian_s_density_at_the_limits_is_as_bounded_as_elsewhere() -> None:
+    """A squashed Gaussian's grows without end there, and its clone term is swamped by it."""
+    actor, observation = make_actor(GaussianActor), torch.zeros(1, S)
+    at_limit = actor.log_prob(observation, torch.ones(1, A)).detach()
+    assert -A * (0.5 * 4.0 + 0.5 * math.log(2 * math.pi)) < float(at_limit) < 0.0
+
+
+def test_the_deterministic_actor_measures_distance_in_shares_of_its_range() -> None:
+    actor, observation = make_actor(DeterministicActor, **LIMITS), torch.randn(B, S)
+    off = actor.act(observation) + torch.tensor([0.2, 0.05])  # a tenth of half the range, and a fifth
+    torch.testing.assert_close(actor.clone_error(observation, off), torch.full((B,), (0.1**2 + 0.2**2) / 2))
