@@ -115,7 +115,7 @@ def test_help_imports_nothing_slow(arguments: list[str], absent: list[str]) -> N
         (["train_model"], "data/dataset.h5"),
         (["train_model", "transfomer"], "no section 'transfomer' below train_model: did you mean 'transformer'?"),
         (["train_model", "--train_model.updates", "9000"], "it is train_model.transformer.updates now"),
-        (["generate_rollouts"], "models/world_model/transformer"),
+        (["generate_rollouts"], "data/dataset.h5"),
         (["generate_rollouts", "none"], "no section 'none' below train_model"),
         (["train_policy", "cql"], "data/dataset.h5"),
         (["train_policy", "etcql"], "no section 'etcql' below train_policy: did you mean 'et_cql'?"),
