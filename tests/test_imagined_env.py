@@ -198,7 +198,9 @@ def same(one: Any, other: Any) -> bool:
         return one.keys() == other.keys() and all(same(one[name], other[name]) for name in one)
     if isinstance(one, np.ndarray) and one.dtype.hasobject:
         return all(same(a, b) for a, b in zip(one, other, strict=True))
-    return (one is None and other is None) or np.array_equal(one, other)
+    if one is None or other is None:
+        return one is other
+    return np.array_equal(one, other)
 
 
 @pytest.mark.parametrize(("mode", "count"), [*((mode, 3) for mode in AutoresetMode), (AutoresetMode.SAME_STEP, 35)])

@@ -81,7 +81,7 @@ ACCURATE: dict[str, tuple[PlannerOptions, float]] = {
     "cem": (CEMOptions(horizon=6, discount=1.0, iterations=6), 1.03),
     "icem": (ICEMOptions(horizon=6, discount=1.0, colour=1.0), 1.02),
     "mppi": (MPPIOptions(horizon=6, discount=1.0, std=0.2, temperature=0.05), 1.05),
-    "gradient": (GradientOptions(horizon=6, discount=1.0, samples=4), 1.02),
+    "gradient": (GradientOptions(horizon=6, discount=1.0, samples=4, iterations=15, learning_rate=0.1), 1.02),
 }
 
 
@@ -136,16 +136,29 @@ class Paid(LinearWorld):
 
 def worth(plan: list[list[float]], *, fall_beyond: float = torch.inf, **options: Any) -> list[float]:
     """J of plans from the origin, in a world where each action adds itself to the first dimension."""
-    value = options.pop("value", None)
+    value, prior = options.pop("value", None), options.pop("prior", None)
     world = Paid(torch.eye(3), torch.tensor([[1.0], [0.0], [0.0]]))
     settings = PlannerOptions(horizon=len(plan[0]), **options)
-    objective = Objective(world, settings, lambda s: s[..., 0] > fall_beyond, None, value)
+    objective = Objective(world, settings, lambda s: s[..., 0] > fall_beyond, None, value, prior)
     return objective.returns(torch.zeros(1, 3), torch.tensor(plan)[None, ..., None])[0].tolist()
 
 
 def test_rewards_are_discounted_and_the_value_of_the_end_follows():
     assert worth([[1.0, 2.0, 3.0]], discount=0.5) == [1 + 1 + 0.75]
     assert worth([[1.0, 2.0, 3.0]], discount=0.5, value=lambda s: 10 * s[:, 0]) == [2.75 + 60 / 8]
+
+
+class Forwards:
+    """Always one to the first dimension."""
+
+    def act(self, observation: Tensor, deterministic: bool = True, generator: Any = None) -> Tensor:
+        return torch.ones(len(observation), 1)
+
+
+def test_in_the_tail_the_prior_goes_on():
+    found = worth([[1.0, 2.0]], discount=0.5, tail=2, prior=Forwards(), value=lambda s: 8 * s[:, 0])
+    assert found == [1 + 1 + 0.25 + 0.125 + 8 * 5 / 16]
+    assert worth([[1.0, 2.0]], discount=1.0, tail=9, prior=Forwards(), fall_beyond=3.5) == [4.0]
 
 
 def test_nothing_follows_a_fall_but_the_step_into_it_counts():
@@ -363,6 +376,7 @@ def refused(words: str, **given: Any) -> None:
 
 def test_bad_input_ends_in_one_sentence():
     refused("horizon is 0, expected an integer, more than 0", options=RandomShootingOptions(horizon=0))
+    refused("tail is 3.*there is none", options=RandomShootingOptions(tail=3))
     refused("discount is 2", options=RandomShootingOptions(discount=2.0))
     refused("2 low and 2 high limits.*actions of size 1", action_low=[-1.0] * 2, action_high=[1.0] * 2)
     refused("finite range", action_high=[float("inf")])

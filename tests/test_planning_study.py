@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from envtf_lit.cli.main import main
+from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.planning import score_planner
 from envtf_lit.policy import TanhGaussianActor, save_policy
@@ -18,6 +19,7 @@ from envtf_lit.robots.tasks import ROBOTS
 from envtf_lit.studies.planning import FAMILIES, PlanningOptions, planning_table, run_planning
 from envtf_lit.world_models.store import save_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
+from tests.logs import dataset_of_chains
 from tests.test_planning import SMALL
 
 # the command line
@@ -57,6 +59,7 @@ def test_envtf_plan_plays_a_planner_beside_its_prior(
         (["--option", "horizon"], "write --option horizon=20"),
         (["--task", "walker2d-medium"], "observations of size 11.*walker2d has 17 and 6"),
         (["--world-model", "nowhere"], "nowhere"),
+        (["--video", "x.gif"], "name them with --dataset"),
         (["--planner", "mpi"], "did you mean 'mppi'"),
     ],
 )
@@ -92,3 +95,11 @@ def test_the_study_measures_every_family_and_draws_a_plan(tmp_path: Path):
     (tmp_path / "notes.json").write_text("{}")
     with pytest.raises(UserError, match="no earlier result"):
         run_planning(tmp_path / "notes.json", work=work, options=options, progress=False)
+
+
+@pytest.mark.slow
+def test_the_video_shows_both_worlds(hopper_model: Path, tmp_path: Path):
+    save_dataset(dataset_of_chains(width=11, actions=3).with_split(0.3, 0), tmp_path / "data.h5")
+    main(envtf_plan(hopper_model, "--video", str(tmp_path / "plan.gif"), "--dataset", str(tmp_path / "data.h5")))
+    with Image.open(tmp_path / "plan.gif") as video:
+        assert video.n_frames > 1  # pyright: ignore[reportAttributeAccessIssue]

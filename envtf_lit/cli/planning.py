@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from envtf_lit.cli.command import CORES, File, Folder, Natural, Positive, run_command
 from envtf_lit.cli.output import console, hush_lightning
+from envtf_lit.errors import UserError
 
 Options = Annotated[tuple[str, ...], "NAME=VALUE"]
 
@@ -21,7 +22,10 @@ def plan(
     steps: Positive | None = None,
     seed: Natural = 0,
     threads: Positive = CORES,
+    precision: Literal["fp32", "bf16"] = "fp32",
     out: File | None = None,
+    video: File | None = None,
+    dataset: File | None = None,
     quiet: bool = False,
 ) -> None:
     """Plays a planner in MuJoCo.
@@ -36,9 +40,17 @@ def plan(
         steps: of an episode at most; default: the robot's 1000.
         seed: of everything random.
         threads: CPU threads.
+        precision: of matrix products while it plans.
         out: JSON.
+        video: GIF of the median episode, beside what the model imagines of the same actions; needs --dataset.
+        dataset: that the model was trained on, in whose units the video tells the error.
         quiet: no progress bar.
+
+    Raises:
+        UserError: a video without a dataset.
     """
+    if video is not None and dataset is None:
+        raise UserError("--video tells the model's error in units of its data: name them with --dataset FILE.")
     import torch
     from rich.table import Table
 
@@ -60,6 +72,7 @@ def plan(
         episodes=episodes,
         steps=steps,
         seed=seed,
+        precision=precision,
         progress=not quiet,
     )
     table = Table("", "return", "score", "steps", "decisions/s", box=None)
@@ -71,9 +84,17 @@ def plan(
     console().print(table, soft_wrap=False)
     if out is not None:
         prior = {} if found.prior is None else {"prior_returns": found.prior.returns.tolist()}
-        asked = dict(task=task, planner=planner, options=list(option), seed=seed, threads=threads)
+        asked = dict(task=task, planner=planner, options=list(option), seed=seed, threads=threads, precision=precision)
         rates = {"returns": found.planned.returns.tolist(), "decisions_per_second": found.decisions_per_second}
         write_json(out, asked | rates | prior)
+    if video is not None:
+        from envtf_lit.data.sources.files import load_dataset
+        from envtf_lit.figures.video import real_vs_imagined
+        from envtf_lit.world_models.forecast import Scale
+        from envtf_lit.world_models.store import load_world_model
+
+        scale = Scale.of(load_dataset(str(dataset)))
+        real_vs_imagined(load_world_model(world_model), found.planned.median, get_task(task).robot, scale, video)
 
 
 def bench_planning(

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from envtf_lit.errors import UserError
-from envtf_lit.options.schema import build
+from envtf_lit.options.schema import Precision, build
 from envtf_lit.planning.planner import Planner
 from envtf_lit.planning.registry import PLANNERS
 from envtf_lit.policy import Policy, load_policy
 from envtf_lit.robots.returns import Returns, evaluate_policy
 from envtf_lit.robots.tasks import Robot
+from envtf_lit.training import autocast
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.store import load_world_model
 
@@ -107,6 +108,7 @@ def score_planner(
     episodes: int,
     steps: int | None = None,
     seed: int,
+    precision: Precision = "fp32",
     progress: bool = True,
 ) -> PlannedReturns:
     """Plays a planner in MuJoCo, and beside it the policy that it starts from.
@@ -119,6 +121,7 @@ def score_planner(
         episodes: of each.
         steps: of an episode at most; None: as many as the robot's episodes have.
         seed: of the episodes and the planner.
+        precision: of matrix products while it plans.
         progress: shows a bar.
 
     Raises:
@@ -133,7 +136,8 @@ def score_planner(
         )
     timed = Timed(planner_of(planner, model, robot, words, prior=prior, seed=seed))
     body = robot if steps is None else replace(robot, max_episode_steps=steps)
-    found = evaluate_policy(timed, body, episodes=episodes, seed=seed, progress=progress)
+    with autocast(torch.device("cpu"), precision):
+        found = evaluate_policy(timed, body, episodes=episodes, seed=seed, progress=progress)
     beside = None
     if prior is not None:
         beside = evaluate_policy(prior, body, episodes=episodes, seed=seed, progress=progress)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from envtf_lit.planning.options import PlannerOptions
+from envtf_lit.policy import Policy
 from envtf_lit.robots.tasks import never_terminated
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.unroll import lost, unroll
@@ -24,8 +25,9 @@ class Objective:
 
         J = sum_t discount^t (r_t - penalty u_t) + discount^H V(s_H)
 
-    Nothing follows a fall. A candidate for which the model has left what it knows is given up: each step that it lacks
-    counts as the worst step, and its end as the worst end, of all candidates beside it.
+    H is the horizon and the tail, in which the prior acts. Nothing follows a fall. A candidate for which the model
+    has left what it knows is given up: each step that it lacks counts as the worst step, and its end as the worst
+    end, of all candidates beside it.
 
     Attributes:
         model: any world model.
@@ -33,6 +35,7 @@ class Objective:
         terminated: the robot's rule.
         reward: takes the place of the model's own; in the data's units.
         value: of the last state; None: nothing follows.
+        prior: acts in the tail.
     """
 
     model: WorldModel
@@ -40,6 +43,7 @@ class Objective:
     terminated: Rule = never_terminated
     reward: Reward | None = None
     value: Value | None = None
+    prior: Policy | None = None
 
     def returns(self, state: Any, plans: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """J (B, N) of N plans (B, N, H, A), in the environment's action range, from each of B rows of a state.
@@ -59,12 +63,15 @@ class Objective:
     def _imagine(
         self, state: Any, plans: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Rewards (R, H), which steps count and which are lost (R, H) bool, and the value (R,) of the end."""
+        """Rewards (R, H + tail), which steps count and which are lost (R, H) bool, and the value (R,) of the end."""
         o, end, table = self.options, plans[:, 0], []
         going = torch.ones(len(plans), dtype=torch.bool, device=plans.device)
         gone = torch.zeros_like(going)
-        act = lambda t, rows, seen: plans[:, t]  # noqa: E731
-        for step in unroll(self.model, state, act, o.horizon, mode=o.mode, generator=generator):
+
+        def act(t: int, rows: Tensor, seen: Tensor) -> Tensor:
+            return plans[:, t] if t < o.horizon or self.prior is None else self.prior.act(seen)
+
+        for step in unroll(self.model, state, act, o.horizon + o.tail, mode=o.mode, generator=generator):
             p = step.prediction
             reward = p.reward if self.reward is None else self.reward(step.observation, step.action, p.observation)
             gone = gone | (going & lost(p, o.novelty_limit))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from envtf_lit.errors import UserError
-from envtf_lit.options.numbers import Count, NonNegative, NonzeroShare, Positive, Share
+from envtf_lit.options.numbers import Count, Natural, NonNegative, NonzeroShare, Positive, Share
 
 
 @dataclass(frozen=True)
@@ -16,6 +16,9 @@ class PlannerOptions:
         discount: of future rewards, per step.
         mode: plans are judged by mean predictions (`mean`) or by one draw each (`sample`).
         warm_start: the search begins at what the plan before has left, not at the middle of the action range.
+        tail: steps after the plan in which a candidate goes on as the prior would; what they pay counts. A short plan
+            with a long tail asks what may be done better now by one who then goes on as before (a rollout, Bertsekas
+            2020), and is not blind to what comes after the horizon.
         penalty: what a unit of the predictions' uncertainty u costs, in the reward's own units, at each step.
         novelty_limit: a candidate is given up where the model's epistemic variance passes this multiple of its 0.999
             quantile over the training data; each step that it lacks then counts as the worst that any candidate met.
@@ -26,6 +29,7 @@ class PlannerOptions:
     discount: NonzeroShare = 0.99
     mode: Literal["mean", "sample"] = "mean"
     warm_start: bool = True
+    tail: Natural = 0
     penalty: NonNegative = 0.0
     novelty_limit: Positive | None = None
 
@@ -118,6 +122,6 @@ class GradientOptions(PlannerOptions):
     """
 
     samples: Count = 16
-    iterations: Count = 15
-    learning_rate: Positive = 0.1
+    iterations: Count = 5
+    learning_rate: Positive = 0.3
     std: Positive = 0.7

@@ -15,7 +15,7 @@ MAX_SPEED, MAX_TORQUE = 8.0, 2.0  # rad/s, N m
 GRAVITY, STEP = 10.0, 0.05  # m/s^2, s; mass and length are 1
 
 
-@dataclass(frozen=True)
+@dataclass
 class TruePendulum:
     """The simulator itself as a `WorldModel`: states are observations (B, 3), cos and sin of the angle and its rate."""
 

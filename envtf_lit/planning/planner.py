@@ -17,7 +17,7 @@ from envtf_lit.robots.tasks import never_terminated
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.unroll import unroll
 
-Options = TypeVar("Options", bound=PlannerOptions)
+Own = TypeVar("Own", bound=PlannerOptions)
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Search:
     elites: Tensor
 
 
-class Planner(ABC, Generic[Options]):
+class Planner(ABC, Generic[Own]):
     """A policy that plans: at every step it searches for the best actions of the next ones, and takes the first.
 
     It follows its episodes through the model, whose state it keeps: each action that `act` returns is taken to be done,
@@ -59,18 +59,19 @@ class Planner(ABC, Generic[Options]):
         seed: of everything random, from `reset` on.
 
     Raises:
-        UserError: an option out of range, or an action range of another size than the model's actions.
+        UserError: an option out of range, a tail without a prior, or an action range of another size than the model's
+            actions.
     """
 
     Options: ClassVar[type[PlannerOptions]]
-    options: Options
+    options: Own
 
     def __init__(
         self,
         model: WorldModel,
         action_low: Tensor | Sequence[float],
         action_high: Tensor | Sequence[float],
-        options: Options | None = None,
+        options: Own | None = None,
         *,
         terminated: Rule = never_terminated,
         reward: Reward | None = None,
@@ -90,9 +91,13 @@ class Planner(ABC, Generic[Options]):
                 f"The action range is {low.tolist()} to {high.tolist()}: a planner searches a finite range, so give "
                 "finite limits, each low one less than its high one."
             )
+        if self.options.tail > 0 and prior is None:
+            raise UserError(
+                f"tail is {self.options.tail}, in which the prior acts, and there is none: give one, or set it to 0."
+            )
         self.model, self.prior, self.seed = model, prior, seed
         self.middle, self.half = 0.5 * (low + high), 0.5 * (high - low)
-        self.objective = Objective(model, self.options, terminated, reward, value)
+        self.objective = Objective(model, self.options, terminated, reward, value, prior)
         self.generators: dict[torch.device, torch.Generator] = {}
         self.reset()
 

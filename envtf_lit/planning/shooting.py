@@ -7,7 +7,7 @@ from torch import Tensor
 
 from envtf_lit.planning.noise import coloured_noise
 from envtf_lit.planning.options import CEMOptions, ICEMOptions, MPPIOptions, PlannerOptions, RandomShootingOptions
-from envtf_lit.planning.planner import Options, Planner, Search, best, chosen
+from envtf_lit.planning.planner import Own, Planner, Search, best, chosen
 
 SMALLEST_STD = 1e-3  # of CEM's Gaussians, in units of half the action range
 
@@ -26,7 +26,7 @@ class RandomShooting(Planner[RandomShootingOptions]):
         return Search(taken, torch.zeros_like(taken), plans, returns, returns.argmax(1, keepdim=True))
 
 
-class GaussianPlanner(Planner[Options]):
+class GaussianPlanner(Planner[Own]):
     """What draws candidates from a Gaussian about a plan."""
 
     def around(

@@ -8,7 +8,7 @@ reward a worse model; what is compared is the gain over random actions:
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from envtf_lit.planning.options import PlannerOptions
 from envtf_lit.planning.pendulum import CHART, ENV_ID, MAX_TORQUE, STEP, TruePendulum
 from envtf_lit.planning.planner import chosen
 from envtf_lit.planning.registry import PLANNERS
-from envtf_lit.planning.value_iteration import ValueIteration
+from envtf_lit.planning.value_iteration import ValueIteration, ValueIterationOptions
 from envtf_lit.policy import Policy, RandomPolicy, begin_episodes
 from envtf_lit.results import claim
 from envtf_lit.studies.machine import facts, seconds
@@ -76,7 +76,7 @@ def run_planning(
     *,
     work: Path = WORK,
     options: PlanningOptions,
-    planners: Mapping[str, PlannerOptions] | None = None,
+    planners: Mapping[str, PlannerOptions | ValueIterationOptions] | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Learns the model, unless it lies in the work folder, and plays every family through it and through the truth.
@@ -85,7 +85,7 @@ def run_planning(
         out: JSON file of the result; the picture of a plan lies beside it. None writes neither.
         work: folder of data, model and what is measured; what lies there from an earlier call is used again.
         options: the amounts.
-        planners: options of families, by name; the others, value iteration among them, have their defaults.
+        planners: options of families, by name; the others have their defaults.
         progress: shows a bar in training.
 
     Returns:
@@ -106,9 +106,8 @@ def run_planning(
     result: dict[str, Any] = {"random.return_mean": float(play(idle, options).mean())}
     for family in FAMILIES:
         for name, model in worlds.items():
-            own = planners.get(family)
-            one = partial(measure, family, model, options, own)
-            key = settings if own is None else settings | {"planner": asdict(own)}
+            own = planners.get(family) or default_options(family)
+            one, key = partial(measure, family, model, options, own), settings | {"planner": asdict(own)}
             found = cached_result(work, f"{family}-{name}", key, [folder] if name == "learned" else [], one)
             result |= {f"{family}.{name}.{key}": value for key, value in found.items()}
         floor = result["random.return_mean"]
@@ -141,7 +140,7 @@ def learned_pendulum(work: Path, options: PlanningOptions, progress: bool) -> Pa
     if not data.exists():
         save_dataset(random_steps(options.transitions, options.seed), data)
     if not folder.exists():
-        train = TransformerOptions(**asdict(MODEL) | {"updates": options.updates, "updates_per_epoch": _epoch(options)})
+        train = replace(MODEL, updates=options.updates, updates_per_epoch=_epoch(options))
         fit_world_model(
             train,
             data,
@@ -187,15 +186,20 @@ def random_steps(count: int, seed: int) -> OfflineDataset:
     ).with_split(0.1, seed)
 
 
-def make_family(family: str, model: WorldModel, seed: int, own: PlannerOptions | None = None) -> Policy:
-    """A planner through a model of the pendulum, with these options or its defaults."""
-    if family == VALUE_ITERATION:
-        return ValueIteration(model, CHART, *RANGE)
+def default_options(family: str) -> PlannerOptions | ValueIterationOptions:
+    """The options that a family has where none are given."""
+    return ValueIterationOptions() if family == VALUE_ITERATION else PLANNERS[family].Options()
+
+
+def make_family(family: str, model: WorldModel, seed: int, own: PlannerOptions | ValueIterationOptions) -> Policy:
+    """A planner through a model of the pendulum."""
+    if isinstance(own, ValueIterationOptions):
+        return ValueIteration(model, CHART, *RANGE, own)
     return PLANNERS[family](model, *RANGE, own, seed=seed)
 
 
 def measure(
-    family: str, model: WorldModel, options: PlanningOptions, own: PlannerOptions | None = None
+    family: str, model: WorldModel, options: PlanningOptions, own: PlannerOptions | ValueIterationOptions
 ) -> dict[str, float]:
     """A family's returns through a model, and its decisions per second (of one episode at a time)."""
     returns = play(make_family(family, model, options.seed, own), options)
@@ -218,7 +222,7 @@ def play(policy: Policy, options: PlanningOptions) -> np.ndarray:
         deterministic = not isinstance(policy, RandomPolicy)
         actions = policy.act(torch.from_numpy(np.stack(seen)), deterministic, None if deterministic else generator)
         steps = [env.step(action) for env, action in zip(envs, actions.numpy(), strict=True)]
-        seen, returns, over = [step[0] for step in steps], returns + [step[1] for step in steps], steps[0][3]
+        seen, returns, over = [step[0] for step in steps], returns + [float(step[1]) for step in steps], steps[0][3]
     for env in envs:
         env.close()
     return returns
