@@ -285,7 +285,7 @@ def test_a_plan_is_never_worse_than_the_priors(name: str):
     observation = observations(1)[0]
     found = planner.search(observation)
     starts = planner._starts(3)
-    torch.testing.assert_close(planner.scaled(starts[:, 1, 0]), prior.act(observation), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(planner.scaled(starts[:, -1, 0]), prior.act(observation), rtol=1e-4, atol=1e-4)
     assert (found.returns.amax(1) >= planner.judge(starts, None).amax(1) - 1e-4).all()
 
 

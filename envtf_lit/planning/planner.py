@@ -182,11 +182,12 @@ class Planner(ABC, Generic[Own]):
             self._state = self.model.observe(self._state, observation)
 
     def _starts(self, rows: int) -> Tensor:
-        """(B, K, H, A) the plans that a search may begin at: what was left, and the prior's."""
+        """(B, K, H, A) plans that a search may begin at: what was left, and the prior's; else idleness."""
         device = self.model.current(self._state).device
         size = rows, self.options.horizon, self.model.action_dim
         left = self._left if self.options.warm_start else None
-        plans = [torch.zeros(size, device=device) if left is None else left]
+        idle = [torch.zeros(size, device=device)] if self.prior is None else []
+        plans = idle if left is None else [left]
         if (prior := self.prior) is not None:
             alone = self.model.gather(self._state, torch.arange(rows, device=device))
             act = lambda t, row, seen: prior.act(seen, deterministic=True)  # noqa: E731
