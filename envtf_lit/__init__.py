@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from envtf_lit.registration import register_environment
+
 if TYPE_CHECKING:
     from envtf_lit.data.sources.files import load_dataset
     from envtf_lit.policy import load_policy
@@ -16,6 +18,8 @@ _EXPORTS = {
     "load_world_model": "envtf_lit.world_models.store",
 }
 __all__ = ["__version__", "load_dataset", "load_policy", "load_world_model"]
+
+register_environment()
 
 
 def __getattr__(name: str) -> Any:

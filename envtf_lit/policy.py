@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypedDict, Unpack, cast
+from typing import Any, ClassVar, Protocol, TypedDict, Unpack, cast, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +24,21 @@ class Policy(Protocol):
     def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
         """Observations (B, S) to actions (B, A) in the environment's own action range."""
         ...
+
+
+@runtime_checkable
+class StatefulPolicy(Policy, Protocol):
+    """A policy that remembers the episodes it is in, such as a planner; its rows stay the same ones."""
+
+    def reset(self) -> None:
+        """Forgets them: others begin."""
+        ...
+
+
+def begin_episodes(policy: Policy) -> None:
+    """Says that new episodes begin, to a policy that would remember the old ones."""
+    if isinstance(policy, StatefulPolicy):
+        policy.reset()
 
 
 def mlp(sizes: Sequence[int], *, layer_norm: bool = False) -> nn.Sequential:

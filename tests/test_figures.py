@@ -13,11 +13,11 @@ import pandas as pd
 import pytest
 import torch
 from analytic import linear_data, linear_world
+from made_up_runs import some_estimates, some_returns, some_rollouts
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
-from reports import some_estimates, some_returns, some_rollouts
 
 from envtf_lit.evaluation.horizon import horizon_report
 from envtf_lit.figures import gallery, learning, scores

@@ -12,7 +12,7 @@ import nbformat
 import numpy as np
 import papermill
 import pytest
-from reports import made_up_run, said
+from made_up_runs import made_up_run, said
 
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.comparison import compare

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from analytic import linear_data, linear_world
-from reports import said
+from made_up_runs import said
 
 from envtf_lit.agents.et_cql import ETCQLOptions
 from envtf_lit.agents.value_gradient import ValueGradientOptions

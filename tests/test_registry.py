@@ -45,7 +45,7 @@ class ToyOptions(PolicyOptions):
 
 
 class Toy(Agent):
-    """Regresses sampled actions on the recorded ones."""
+    """Clones the log, at a pull of its own."""
 
     Options: ClassVar[type[PolicyOptions]] = ToyOptions
     label = "Toy regression"
@@ -55,8 +55,7 @@ class Toy(Agent):
         return dict(actor=Part(self.actor, self.options.actor_learning_rate))
 
     def losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
-        action, _ = self.actor.sample(batch["observations"], generator=self.generator)
-        loss = self.options.pull * (action - batch["actions"]).square().mean()
+        loss = self.options.pull * self.actor.clone_error(batch["observations"], batch["actions"]).mean()
         yield "actor", loss, dict(toy_loss=loss)
 
 

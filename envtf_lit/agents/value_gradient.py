@@ -13,12 +13,12 @@ from envtf_lit.agents.agent import Agent, Batch, Logs, Phase, follow
 from envtf_lit.agents.networks import StateValue
 from envtf_lit.imagination.buffer import Imagination
 from envtf_lit.imagination.histories import Histories
-from envtf_lit.imagination.rollouts import Rollouts, gather_steps, lost
+from envtf_lit.imagination.rollouts import Rollouts, gather_steps
 from envtf_lit.options.numbers import Count, NonNegative, NonzeroShare, Positive
 from envtf_lit.options.schema import rare
 from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.world_models.interface import Prediction
-from envtf_lit.world_models.unroll import Step, unroll
+from envtf_lit.world_models.unroll import Step, lost, unroll
 
 HIDDEN = (256, 256)  # units of the state value
 LEARNING_RATE = 0.001  # of the state value

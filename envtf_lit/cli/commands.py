@@ -64,6 +64,10 @@ COMMANDS = {
     ),
     "bench model": Command("studies", "Imagination and training, against ensemble, simulator and matrix product"),
     "bench cost": Command("studies", "Training to equal held-out error: transformer, ensemble, plain network", _KEPT),
+    "bench planning": Command(
+        "planning", "Planners on a pendulum: through a model learned from random steps, and through the truth", _KEPT
+    ),
+    "plan": Command("planning", "Play a planner in MuJoCo: it searches a world model at every step"),
     "doctor": Command("project", "Print versions, threads, GL, disk and GPU for a bug report"),
 }
 GROUPS = {

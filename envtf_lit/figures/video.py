@@ -111,7 +111,7 @@ def _render(robot: Robot, positions: np.ndarray, size: int, backend: str) -> np.
         source, target = f"{folder}/poses.npz", f"{folder}/frames.npz"
         np.savez(source, model=_simulator(robot).fullpath, positions=positions, size=size)
         subprocess.run(
-            [sys.executable, "-m", "envtf_lit.figures.render", source, target],
+            [sys.executable, "-m", "envtf_lit.robots.render", source, target],
             env=os.environ | {"MUJOCO_GL": backend},
             cwd=folder,  # for MuJoCo's log
             check=True,

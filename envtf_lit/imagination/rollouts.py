@@ -6,11 +6,10 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from envtf_lit.errors import UserError
 from envtf_lit.imagination.histories import Histories
 from envtf_lit.policy import Actor, Policy
-from envtf_lit.world_models.interface import Mode, Prediction, WorldModel
-from envtf_lit.world_models.unroll import Step, unroll
+from envtf_lit.world_models.interface import Mode, WorldModel
+from envtf_lit.world_models.unroll import Step, lost, unroll
 
 Rule = Callable[[Tensor], Tensor]  # next observations (..., S) to bool (...): whether the robot has fallen
 
@@ -173,15 +172,3 @@ def gather_steps(steps: Iterable[tuple[Step, Tensor, Tensor]], count: int) -> Ro
 def _spread(column: Tensor, rows: Tensor, count: int) -> Tensor:
     """Values (R, …) of some rows as (B, …), zeros elsewhere."""
     return column.new_zeros(count, *column.shape[1:]).index_copy(0, rows, column)
-
-
-def lost(prediction: Prediction, novelty_limit: float | None) -> Tensor:
-    """(R,) where the model has left what it knows, so far as anyone wants to know."""
-    if novelty_limit is None:
-        return torch.zeros_like(prediction.reward, dtype=torch.bool)
-    if prediction.novelty is None:
-        raise UserError(
-            "novelty_limit is set and the world model has no epistemic variance to hold against it: train a "
-            "transformer with epistemic: laplace or an ensemble of several members, or set novelty_limit to null."
-        )
-    return prediction.novelty > novelty_limit

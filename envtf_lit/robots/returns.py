@@ -7,13 +7,14 @@ import numpy as np
 import torch
 
 from envtf_lit.errors import UserError
-from envtf_lit.policy import Policy
+from envtf_lit.policy import Policy, StatefulPolicy, begin_episodes
 from envtf_lit.progress import progress_bar
 from envtf_lit.robots.tasks import Robot
 
 SEED_OFFSET = 1000  # keeps evaluation seeds apart from those that data was collected with
 # A matrix product may round a row differently in a batch of another size, and contacts amplify the last bit. The policy
-# is therefore always asked for this many rows, and episode i always sits in row i % ROWS.
+# is therefore always asked for this many rows, and episode i always sits in row i % ROWS. Not so planners, to whom each
+# row is much work: their episodes may come out otherwise, by rounding, beside another number of others.
 ROWS = 32
 
 
@@ -56,10 +57,10 @@ class Returns:
 def evaluate_policy(policy: Policy, robot: Robot, *, episodes: int, seed: int, progress: bool = True) -> Returns:
     """Runs exactly one episode per seed `seed + 1000 + i`, with deterministic actions.
 
-    Episode i comes out the same whatever number of episodes runs beside it.
+    Episode i comes out the same whatever number of episodes runs beside it, but for the rounding of stateful policies.
 
     Args:
-        policy: acts on float32 observations (B, S).
+        policy: acts on float32 observations (B, S); a stateful one is reset before each group of at most 32 episodes.
         robot: whose environment is made.
         episodes: number of episodes, at least 1.
         seed: base of the episodes' seeds.
@@ -115,7 +116,8 @@ class _Lane:
 
 def _play(policy: Policy, robot: Robot, seeds: list[int], advance: Callable[[], None]) -> list[Episode]:
     lanes = [_Lane(robot, seed) for seed in seeds]
-    batch = torch.zeros(ROWS, robot.observation_dim)
+    batch = torch.zeros(len(seeds) if isinstance(policy, StatefulPolicy) else ROWS, robot.observation_dim)
+    begin_episodes(policy)
     while any(lane.running for lane in lanes):
         for row, lane in enumerate(lanes):
             batch[row] = torch.from_numpy(lane.observations[-1])

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from envtf_lit.errors import UserError
 from envtf_lit.world_models.interface import Mode, Prediction, WorldModel
 
 
@@ -68,3 +69,19 @@ def unroll(
         how = mode(t) if callable(mode) else mode
         state, prediction = model.step(state, action, mode=how, generator=generator)
         yield Step(t, rows, observation, action, prediction)
+
+
+def lost(prediction: Prediction, novelty_limit: float | None) -> Tensor:
+    """(R,) bool, where the model has left what it knows, so far as anyone wants to know.
+
+    Raises:
+        UserError: a novelty limit is given and the model has no epistemic variance.
+    """
+    if novelty_limit is None:
+        return torch.zeros_like(prediction.reward, dtype=torch.bool)
+    if prediction.novelty is None:
+        raise UserError(
+            "novelty_limit is set and the world model has no epistemic variance to hold against it: train a "
+            "transformer with epistemic: laplace or an ensemble of several members, or set novelty_limit to null."
+        )
+    return prediction.novelty > novelty_limit

@@ -1,6 +1,6 @@
 """Draws a robot in given poses; meant to run as a child process, since MUJOCO_GL must be set before MuJoCo is imported.
 
-    python -m envtf_lit.figures.render poses.npz frames.npz
+    python -m envtf_lit.robots.render poses.npz frames.npz
 
 With MUJOCO_GL set to `egl` or `osmesa` MuJoCo renders; with `disabled` the links are drawn as lines.
 """

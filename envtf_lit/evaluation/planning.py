@@ -1,0 +1,144 @@
+"""A planner in the simulator: its returns, and how many decisions it makes in a second."""
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from envtf_lit.errors import UserError
+from envtf_lit.options.schema import Precision, build
+from envtf_lit.planning.planner import Planner
+from envtf_lit.planning.registry import PLANNERS
+from envtf_lit.policy import Policy, load_policy
+from envtf_lit.robots.returns import Returns, evaluate_policy
+from envtf_lit.robots.tasks import Robot
+from envtf_lit.training import autocast
+from envtf_lit.world_models.interface import WorldModel
+from envtf_lit.world_models.store import load_world_model
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedReturns:
+    """What a planner reached.
+
+    Attributes:
+        planned: its episodes.
+        decisions_per_second: for one episode alone, if there was one; else for all of them together.
+        prior: the prior's own episodes from the same seeds; None without one.
+    """
+
+    planned: Returns
+    decisions_per_second: float
+    prior: Returns | None
+
+
+class Timed:
+    """A planner, and the seconds that its decisions take.
+
+    Attributes:
+        seconds, decisions: so far.
+    """
+
+    def __init__(self, planner: Planner[Any]) -> None:
+        self.planner, self.seconds, self.decisions = planner, 0.0, 0
+
+    def reset(self) -> None:
+        """See `Planner.reset`."""
+        self.planner.reset()
+
+    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
+        """See `Planner.act`."""
+        begin = time.perf_counter()
+        action = self.planner.act(observation, deterministic, generator)
+        self.seconds += time.perf_counter() - begin
+        self.decisions += len(observation)
+        return action
+
+
+def planner_of(
+    name: str, model: WorldModel, robot: Robot, words: Sequence[str] = (), *, prior: Policy | None = None, seed: int = 0
+) -> Planner[Any]:
+    """The planner of that name for a robot.
+
+    Args:
+        name: of `PLANNERS`.
+        model: any world model.
+        robot: whose rule ends plans, and whose action range is searched.
+        words: its options that are not the default, such as `horizon=20`.
+        prior: see `Planner`.
+        seed: of everything random.
+
+    Raises:
+        UserError: an unknown option, one out of range, or a model of another robot.
+    """
+    if (model.observation_dim, model.action_dim) != (robot.observation_dim, robot.action_dim):
+        raise UserError(
+            f"The world model has observations of size {model.observation_dim} and actions of size {model.action_dim}, "
+            f"and {robot.name}{robot.variant} has {robot.observation_dim} and {robot.action_dim}: take a model that "
+            "was trained on this robot."
+        )
+    cls, limit = PLANNERS[name], [robot.action_limit] * robot.action_dim
+    options = build(cls.Options, dict(_assignment(word) for word in words), "")
+    return cls(model, [-x for x in limit], limit, options, terminated=robot.terminated, prior=prior, seed=seed)
+
+
+def _assignment(word: str) -> tuple[str, Any]:
+    """NAME=VALUE, the value a number, true, false or null, else text."""
+    name, equals, text = word.partition("=")
+    if not (name and equals):
+        raise UserError(f"--option {word!r} has no name and value: write --option horizon=20.")
+    try:
+        return name, json.loads(text)
+    except ValueError:
+        return name, text
+
+
+def score_planner(
+    world_model: Path,
+    robot: Robot,
+    planner: str,
+    words: Sequence[str] = (),
+    *,
+    policy: Path | None = None,
+    episodes: int,
+    steps: int | None = None,
+    seed: int,
+    precision: Precision = "fp32",
+    progress: bool = True,
+) -> PlannedReturns:
+    """Plays a planner in MuJoCo, and beside it the policy that it starts from.
+
+    Args:
+        world_model: folder.
+        robot: whose simulator is played in.
+        planner, words: as of `planner_of`.
+        policy: folder of the prior; None plans without one.
+        episodes: of each.
+        steps: of an episode at most; None: as many as the robot's episodes have.
+        seed: of the episodes and the planner.
+        precision: of matrix products while it plans.
+        progress: shows a bar.
+
+    Raises:
+        UserError: as of `planner_of`, or a folder that holds no world model or no policy of this robot.
+    """
+    model = load_world_model(world_model)
+    prior = None if policy is None else load_policy(policy)
+    if prior is not None and len(prior.observation_mean) != robot.observation_dim:
+        raise UserError(
+            f"{policy} holds a policy of observations of size {len(prior.observation_mean)}, and {robot.name} has "
+            f"{robot.observation_dim}: take one that was trained on this robot."
+        )
+    timed = Timed(planner_of(planner, model, robot, words, prior=prior, seed=seed))
+    body = robot if steps is None else replace(robot, max_episode_steps=steps)
+    with autocast(torch.device("cpu"), precision):
+        found = evaluate_policy(timed, body, episodes=episodes, seed=seed, progress=progress)
+    beside = None
+    if prior is not None:
+        beside = evaluate_policy(prior, body, episodes=episodes, seed=seed, progress=progress)
+    return PlannedReturns(found, timed.decisions / timed.seconds, beside)
