@@ -67,6 +67,7 @@ def learned_value(cls: Any, **options: Any) -> tuple[float, float]:
     return tuple(float(agent.critics(states, actions).min(0).values.mean().detach()) for actions in (drawn, recorded))  # pyright: ignore[reportReturnType]
 
 
+@pytest.mark.slow
 def test_cqls_q_lies_below_the_true_value_and_sacs_does_not() -> None:
     assert learned_value(SAC)[0] == pytest.approx(2.0, rel=0.05)
     assert learned_value(CQL, cql_weight=1.0)[0] < 1.9

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterable
+from functools import cache
 from importlib.metadata import requires, version
 from pathlib import Path
 
@@ -122,6 +123,7 @@ def third_party(code: str) -> set[str]:
     return names - sys.stdlib_module_names - {"envtf_lit"}
 
 
+@cache
 def imported() -> dict[str, set[str]]:
     """By module or notebook."""
     sources = {
