@@ -64,10 +64,17 @@ COMMANDS = {
     ),
     "bench model": Command("studies", "Imagination and training, against ensemble, simulator and matrix product"),
     "bench cost": Command("studies", "Training to equal held-out error: transformer, ensemble, plain network", _KEPT),
+    "export policy": Command("export", "Write a policy as ONNX or torch.export: observation to action"),
+    "export model": Command(
+        "export", "Write a world model's step as ONNX or torch.export, its cache an input and output"
+    ),
+    "policy act": Command("export", "Print a policy's actions for observations in a .npy file"),
     "doctor": Command("project", "Print versions, threads, GL, disk and GPU for a bug report"),
 }
 GROUPS = {
     "data": "Check a dataset, or convert it to another format",
     "zoo": "Datasets of four robots from behaviour policies that come along: list, build, or train your own",
+    "export": "Write a policy or a world model as a file that runs without this package",
+    "policy": "Ask a policy for actions",
     "bench": "Measure the world model's speed and what its accuracy costs, beside what it would replace",
 }
