@@ -69,6 +69,9 @@ COMMANDS = {
         "export", "Write a world model's step as ONNX or torch.export, its cache an input and output"
     ),
     "policy act": Command("export", "Print a policy's actions for observations in a .npy file"),
+    "card": Command("sharing", "Write a model's card: data, scores, calibration, limits, versions, licence"),
+    "push": Command("sharing", "Send a model and its card to a folder or to the Hugging Face hub"),
+    "pull": Command("sharing", "Fetch a model from a folder or from the Hugging Face hub, and check it"),
     "doctor": Command("project", "Print versions, threads, GL, disk and GPU for a bug report"),
 }
 GROUPS = {
