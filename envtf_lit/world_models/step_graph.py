@@ -62,7 +62,7 @@ class StepGraph(nn.Module, ABC):
 class TransformerStep(StepGraph):
     """The Environment Transformer's: `observation`, `action`, `noise`, `cache` and `clock` to what comes next.
 
-    Shapes: observation (B, S), action (B, A), noise (B, S + 1), cache (B, layers, 2, context, H, d) of keys and values,
+    Shapes: observation (B, S), action (B, A), noise (B, S + 1), cache (B, layers, 2, H, context, d) of keys and values,
     clock (B,) int64, the tokens that each row has had. Zero noise gives the mean, standard normal noise a sample.
     """
 
@@ -77,7 +77,7 @@ class TransformerStep(StepGraph):
     def start(self, rows: int) -> dict[str, Tensor]:
         """See `StepGraph.start`: an empty ring, and clocks at zero."""
         o = self.options
-        ring = torch.zeros(rows, o.layers, 2, o.context, o.heads, o.width // o.heads)
+        ring = torch.zeros(rows, o.layers, 2, o.heads, o.context, o.width // o.heads)
         return {"cache": ring, "clock": torch.zeros(rows, dtype=torch.int64)}
 
     def forward(
@@ -102,18 +102,18 @@ class TransformerStep(StepGraph):
 def _advance(
     block: Block, x: Tensor, ring: Tensor, here: Tensor, visible: Tensor, cos_sin: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """A block's output (B, D) and its ring (B, 2, C, H, d), the token (B, D) in its slot."""
+    """A block's output (B, D) and its ring (B, 2, H, C, d), the token (B, D) in its slot."""
     attention = block.attention
-    _, _, _, heads, width = ring.shape
+    _, _, heads, _, width = ring.shape
     qkv = attention.qkv(block.attention_norm(x)).view(-1, 3, heads, width)
     cos, sin = cos_sin
     q, k = rotate(qkv[:, :2], (cos[:, None, None], sin[:, None, None])).unbind(1)  # (B, H, d)
-    written = torch.stack([k, qkv[:, 2]], 1)[:, :, None]  # (B, 2, 1, H, d)
-    ring = torch.where(here[:, None, :, None, None], written, ring)
-    keys, values = ring.unbind(1)  # (B, C, H, d)
-    score = (q[:, None] * keys).sum(-1) * width**-0.5  # (B, C, H)
-    weight = score.masked_fill(~visible[..., None], float("-inf")).softmax(1)
-    return block.finish(x, attention.out((weight[..., None] * values).sum(1).flatten(1))), ring
+    written = torch.stack([k, qkv[:, 2]], 1)[:, :, :, None]  # (B, 2, H, 1, d)
+    ring = torch.where(here[:, None, None, :, None], written, ring)
+    keys, values = ring.unbind(1)  # (B, H, C, d)
+    score = q[:, :, None] @ keys.transpose(-2, -1) * width**-0.5  # (B, H, 1, C)
+    weight = score.masked_fill(~visible[:, None, None], float("-inf")).softmax(-1)
+    return block.finish(x, attention.out((weight @ values).flatten(1))), ring
 
 
 class EnsembleStep(StepGraph):
