@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from envtf_lit.errors import UserError, missing_extra
 from envtf_lit.files import replacing
 from envtf_lit.policy import Actor, DeterministicActor, GaussianActor, TanhGaussianActor, kind_of
 from envtf_lit.world_models.ensemble import EnsembleDynamics
+from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.step_graph import NEXT, StepGraph, step_graph
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 
@@ -143,11 +144,12 @@ def export_world_model(model: EnvironmentTransformer | EnsembleDynamics, out: st
     """
     graph = step_graph(model).eval()
     ring = isinstance(model, EnvironmentTransformer)
+    context = model.options.context if ring else 1
     metadata = dict(
         kind="environment_transformer" if ring else "ensemble_dynamics",
         observation_dim=model.observation_dim,
         action_dim=model.action_dim,
-        context=model.options.context if ring else 1,
+        context=context,
         arguments=model.arguments,
         observation_mean=model.normaliser.observation_mean.tolist(),
     )
@@ -155,7 +157,7 @@ def export_world_model(model: EnvironmentTransformer | EnsembleDynamics, out: st
     examples = _rows(model, generator) | {"noise": torch.zeros(ROWS, model.observation_dim + 1)} | graph.start(ROWS)
 
     def compare(run: Run) -> None:
-        _compare_steps(model, graph, run, metadata["context"] + BEYOND, out)
+        _compare_steps(model, graph, run, context + BEYOND, out)
 
     with torch.no_grad():
         _write(_Graph(graph, graph.inputs, graph.outputs, examples, metadata, compare), Path(out))
@@ -178,21 +180,24 @@ def _compare_steps(
 ) -> None:
     """Runs both side by side, each on its own cache: `model.step` itself, and what was written."""
     generator = torch.Generator().manual_seed(1)
-    scales = model.normaliser
+    world, scales = cast(WorldModel, model), model.normaliser
     spread = torch.cat([scales.observation_std, scales.target_std[-1:]])
     sizes = dict.fromkeys(("mean", "aleatoric", "epistemic"), spread)
     sizes |= {"next_observation": spread[:-1], "reward": spread[-1:]}
     begun = _rows(model, generator)
     empty = torch.zeros(ROWS, 0, model.action_dim)
-    state = model.init(begun["observation"][:, None], empty, torch.ones(ROWS, dtype=torch.int64))
-    carried = {"noise": torch.zeros(ROWS, model.observation_dim + 1)} | graph.start(ROWS)
+    state = world.init(begun["observation"][:, None], empty, torch.ones(ROWS, dtype=torch.int64))
+    carried = begun | {"noise": torch.zeros(ROWS, model.observation_dim + 1)} | graph.start(ROWS)
     for _ in range(steps):
         inputs = _rows(model, generator)
-        state, prediction = model.step(model.observe(state, inputs["observation"]), inputs["action"])
+        state, prediction = world.step(world.observe(state, inputs["observation"]), inputs["action"])
         found = run(carried | inputs)
         expected = dict(zip(graph.outputs, graph.named(prediction), strict=False))
         _compare(expected, {name: found[name] for name in expected}, sizes, out)
         carried |= {name.removeprefix(NEXT): value for name, value in found.items() if name.startswith(NEXT)}
+    carried["noise"] = torch.randn(ROWS, model.observation_dim + 1, generator=generator)
+    drawn = dict(zip(graph.outputs, graph(*(carried[name] for name in graph.inputs)), strict=True))
+    _compare(drawn, run(carried), sizes, out)
 
 
 def _compare(expected: Named, found: Named, sizes: Named, out: str | Path) -> None:
@@ -266,6 +271,7 @@ def _write_onnx(graph: _Graph, metadata: dict[str, Any], path: Path) -> None:
     model = program.model
     ends = [*model.graph.inputs, *model.graph.outputs]
     for value in ends:
+        assert value.shape is not None
         value.shape[0] = "batch"  # where torch has a number of its own
     for value in (value for node in model.graph for value in node.outputs if value not in ends):
         value.name = f"{value.name}_"  # torch's names, such as `mean`, may be those of outputs

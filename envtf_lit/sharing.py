@@ -74,7 +74,7 @@ def push(folder: str | Path, target: str, card: Callable[[Path], str], *, privat
     """
     folder = Path(folder)
     _check(folder)
-    text = (folder / CARD).read_text() if (folder / CARD).is_file() else card(folder)
+    text = (folder / CARD).read_text(errors="replace") if (folder / CARD).is_file() else card(folder)
     if target.startswith(HUB):
         _to_hub(folder, _repository(target), text, private)
         return
@@ -208,10 +208,18 @@ def _get(repository: str, address: str) -> Iterator[requests.Response]:
         raise _refusal(repository, None, error) from None
 
 
+def _pieces(response: requests.Response, name: str, most: int) -> Iterator[bytes]:
+    """The body, up to so many bytes, whatever was announced."""
+    size = 0
+    for piece in response.iter_content(PIECE):
+        size += len(piece)
+        _check_size(name, size, most)
+        yield piece
+
+
 def _json(repository: str, address: str) -> Any:
     with _get(repository, address) as response:
-        content = response.raw.read(JSON_BYTES + 1)
-        _check_size(f"The list of hf:{repository}'s files", len(content), JSON_BYTES)
+        content = b"".join(_pieces(response, f"The list of hf:{repository}'s files", JSON_BYTES))
     try:
         return json.loads(content)
     except (ValueError, RecursionError):
@@ -220,11 +228,10 @@ def _json(repository: str, address: str) -> Any:
 
 def _download(repository: str, address: str, path: Path, name: str, facts: dict[str, Any]) -> None:
     """One file, of the size and sum that the hub has stated."""
-    size, most, digest = 0, ALLOWED[name], hashlib.sha256()
+    size, digest = 0, hashlib.sha256()
     with _get(repository, address) as response, path.open("wb") as stream:
-        for piece in response.iter_content(PIECE):
+        for piece in _pieces(response, f"{name} of hf:{repository}", ALLOWED[name]):
             size += len(piece)
-            _check_size(f"{name} of hf:{repository}", size, most)
             digest.update(piece)
             stream.write(piece)
     stated, large = facts.get("size"), facts.get("lfs")

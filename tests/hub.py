@@ -20,7 +20,7 @@ class Hub:
     Attributes:
         files: by repository and name.
         status: of every answer, where it is not 0.
-        half: of this file only the first half comes, though the whole is announced.
+        half: of this file, or of the `facts` of a repository, only the first half comes, though the whole is announced.
         stated: sizes that it lies about.
         token: that it wants, where it is not empty.
         commits: repositories that were written to.
@@ -98,10 +98,10 @@ def _handler(hub: Hub) -> type[BaseHTTPRequestHandler]:
                 if name.endswith(".safetensors"):
                     row["lfs"] = {"sha256": hashlib.sha256(content).hexdigest(), "size": row["size"]}
                 rows.append(row)
-            self._json({"id": repository, "sha": COMMIT, "siblings": rows})
+            self._json({"id": repository, "sha": COMMIT, "siblings": rows}, half=hub.half == "facts")
 
-        def _json(self, content: Any) -> None:
-            self._send(json.dumps(content).encode())
+        def _json(self, content: Any, *, half: bool = False) -> None:
+            self._send(json.dumps(content).encode(), half=half)
 
         def _send(self, content: bytes, *, half: bool = False) -> None:
             self.send_response(200)

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from envtf_lit.data.check_report import inspect_source
+from envtf_lit.data.columns import Column
 from envtf_lit.data.conversion import convert
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.sources.files import load_dataset, save_dataset
@@ -18,8 +19,8 @@ from envtf_lit.errors import UserError
 from tests.logs import assert_equal, columns, dataset_of_chains, write
 
 
-def lists(values: np.ndarray) -> list[list[float]]:
-    return values.tolist()
+def lists(values: Column) -> list[list[float]]:
+    return np.asarray(values).tolist()
 
 
 def lerobot(data: OfflineDataset) -> dict[str, Any]:

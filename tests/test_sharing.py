@@ -155,7 +155,7 @@ FAILURES: dict[str, tuple[Callable[[Hub], object], str]] = {
     "404": (lambda hub: hub.files.pop("a/b"), r"does not exist \(404\): check the name"),
     "500": (lambda hub: setattr(hub, "status", 500), "the hub answers 500: try again later"),
     "half a file": (lambda hub: setattr(hub, "half", "weights.safetensors"), "broke off .*: try again"),
-    "half an answer": (lambda hub: setattr(hub, "half", "config.json"), "broke off .*: try again"),
+    "half an answer": (lambda hub: setattr(hub, "half", "facts"), "broke off .*: try again"),
     "another size": (stated, r"weights.safetensors of hf:a/b came damaged \(.* bytes of 17\)"),
     "another model": (swapped, "hf:a/b/config.json does not describe a tanh_gaussian"),
     "too large": (large, "resolved.json of hf:a/b has .* bytes, and such a file has at most 4,194,304"),

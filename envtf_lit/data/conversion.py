@@ -45,7 +45,8 @@ def convert(
     to_minari = target.startswith(MINARI)
     to_parquet = not to_minari and Path(target).suffix.lower() in PARQUET
     if not to_minari:
-        to_parquet or is_hdf5(Path(target))
+        if not to_parquet:
+            is_hdf5(Path(target))
         if Path(target).exists():
             raise UserError(f"{target} exists already: give the new file another name, or delete this one.")
     limits = {"action_low": action_low, "action_high": action_high}
