@@ -28,6 +28,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 # modules that need more than the library's own dependencies
 NEED = {
+    "envtf_lit/data/sources/parquet.py": "parquet",
+    "envtf_lit/export.py": "export",
     "envtf_lit/figures/notebook.py": "pipeline",
     "envtf_lit/figures/report.py": "pipeline",
     "envtf_lit/zoo/train.py": "behaviour",
@@ -181,7 +183,9 @@ def test_init_says_how_to_get_dvc(
 
 WITHOUT_EXTRAS = """
 import sys
-for name in "dvc dvclive IPython ipykernel jinja2 jupyter_client nbconvert nbformat papermill sbx tensorboard".split():
+names = "dvc dvclive IPython ipykernel jinja2 jupyter_client nbconvert nbformat onnx onnxruntime onnxscript papermill "
+names += "pyarrow sbx tensorboard"
+for name in names.split():
     sys.modules[name] = None
 import envtf_lit.pipeline.evaluate, envtf_lit.pipeline.train_policy, envtf_lit.cli.lightning
 import envtf_lit.zoo.build, envtf_lit.studies.horizon

@@ -68,10 +68,20 @@ COMMANDS = {
         "planning", "Planners on a pendulum: through a model learned from random steps, and through the truth", _KEPT
     ),
     "plan": Command("planning", "Play a planner in MuJoCo: it searches a world model at every step"),
+    "export policy": Command("export", "Write a policy as ONNX or torch.export: observation to action"),
+    "export model": Command(
+        "export", "Write a world model's step as ONNX or torch.export, its cache an input and output"
+    ),
+    "policy act": Command("export", "Print a policy's actions for observations in a .npy file"),
+    "card": Command("sharing", "Write a model's card: data, scores, calibration, limits, versions, licence"),
+    "push": Command("sharing", "Send a model and its card to a folder or to the Hugging Face hub"),
+    "pull": Command("sharing", "Fetch a model from a folder or from the Hugging Face hub, and check it"),
     "doctor": Command("project", "Print versions, threads, GL, disk and GPU for a bug report"),
 }
 GROUPS = {
     "data": "Check a dataset, or convert it to another format",
     "zoo": "Datasets of four robots from behaviour policies that come along: list, build, or train your own",
+    "export": "Write a policy or a world model as a file that runs without this package",
+    "policy": "Ask a policy for actions",
     "bench": "Measure the world model's speed and what its accuracy costs, beside what it would replace",
 }

@@ -14,7 +14,7 @@ def check(source: Source, /, *, task: str | None = None) -> None:
     """Prints what a dataset holds; exits with status 2 where it cannot be used.
 
     Args:
-        source: HDF5 or NPZ file, minari:ID, or a Minari dataset's folder.
+        source: HDF5, NPZ, Parquet or CSV file, minari:ID, or the folder of a Minari or LeRobot dataset.
         task: robot and tier that the data came from, such as hopper-medium.
     """
     from envtf_lit.data.check_report import inspect_source, render
@@ -37,8 +37,8 @@ def convert(
     """Writes a dataset in another format.
 
     Args:
-        source: HDF5 or NPZ file, minari:ID, or a Minari dataset's folder.
-        target: a new file ending in .h5, .hdf5 or .npz, or minari:ID.
+        source: HDF5, NPZ, Parquet or CSV file, minari:ID, or the folder of a Minari or LeRobot dataset.
+        target: a new file ending in .h5, .hdf5, .npz or .parquet, or minari:ID.
         task: robot and tier that the data came from, such as hopper-medium.
         action_low: low limits of the actions, one number or one for each dimension, where the file states none.
         action_high: high limits, likewise.

@@ -15,7 +15,7 @@ from envtf_lit.data.checks import examine
 from envtf_lit.data.columns import blocks, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.findings import Finding
-from envtf_lit.data.sources.minari import open_source
+from envtf_lit.data.sources.local import open_source
 from envtf_lit.data.statistics import CONSTANT
 from envtf_lit.errors import UserError
 from envtf_lit.robots.tasks import get_task
@@ -80,6 +80,7 @@ def inspect_source(source: str | Path, *, task: str | None = None) -> Inspection
             result.columns = [_describe(name, values) for name, values in raw.columns.items()]
             result.ignored = raw.ignored
             result.dataset, result.findings = examine(raw.columns, raw.attributes, task=task, broken=raw.broken)
+            result.findings += raw.notes
     except UserError as error:
         result.findings = [Finding("error", str(error).rstrip("."))]
     if result.dataset is not None:

@@ -1,4 +1,4 @@
-"""Conversion of datasets between HDF5, NPZ and Minari, and what that changes."""
+"""Conversion of datasets between HDF5, NPZ, Parquet and Minari, from CSV too, and what that changes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +9,9 @@ from envtf_lit.data.checks import examine
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.findings import Finding
 from envtf_lit.data.sources.files import is_hdf5, save_dataset
-from envtf_lit.data.sources.minari import MINARI, open_source, write_minari
+from envtf_lit.data.sources.local import open_source
+from envtf_lit.data.sources.minari import MINARI, write_minari
+from envtf_lit.data.sources.parquet import PARQUET, write_parquet
 from envtf_lit.errors import UserError
 
 
@@ -23,12 +25,14 @@ def convert(
 ) -> tuple[OfflineDataset, list[Finding]]:
     """Reads a dataset and writes it as something else.
 
-    HDF5 and NPZ hold the same columns, bit for bit. Minari keeps T+1 observations of an episode of T steps: where a
-    next observation differs from the following row's, `write_minari` splits the episode.
+    HDF5, NPZ and Parquet hold the same columns, bit for bit. Minari keeps T+1 observations of an episode of T steps:
+    where a next observation differs from the following row's, `write_minari` splits the episode.
 
     Args:
-        source: an HDF5 or NPZ file, `minari:` and the id of a Minari dataset on this machine, or its folder.
-        target: a new file ending in .h5, .hdf5 or .npz, or `minari:` and a new id, such as `minari:my/robot-v0`.
+        source: an HDF5, NPZ, Parquet or CSV file, `minari:` and the id of a Minari dataset on this machine, or its
+            folder, or that of a LeRobot dataset.
+        target: a new file ending in .h5, .hdf5, .npz or .parquet, or `minari:` and a new id, such as
+            `minari:my/robot-v0`.
         task: such as `hopper-medium-replay`; None takes the name in the source, where there is one.
         action_low, action_high: one number, or one for each action dimension; None takes what the source states.
 
@@ -39,15 +43,17 @@ def convert(
         UserError: the source cannot be used, or the target exists or cannot be written. Nothing half-written stays.
     """
     to_minari = target.startswith(MINARI)
+    to_parquet = not to_minari and Path(target).suffix.lower() in PARQUET
     if not to_minari:
-        is_hdf5(Path(target))
+        if not to_parquet:
+            is_hdf5(Path(target))
         if Path(target).exists():
             raise UserError(f"{target} exists already: give the new file another name, or delete this one.")
     limits = {"action_low": action_low, "action_high": action_high}
     stated = {name: np.asarray(values) for name, values in limits.items() if values is not None}
     dataset, findings = _read(source, task, stated)
     if not to_minari:
-        save_dataset(dataset, target)
+        (write_parquet if to_parquet else save_dataset)(dataset, target)
         return dataset, findings
     splits = write_minari(dataset, target.removeprefix(MINARI))
     if splits:
@@ -64,6 +70,7 @@ def convert(
 def _read(source: str, task: str | None, stated: dict[str, np.ndarray]) -> tuple[OfflineDataset, list[Finding]]:
     with open_source(source) as raw:
         dataset, findings = examine(raw.columns, raw.attributes | stated, task=task, broken=raw.broken)
+    findings += raw.notes
     if dataset is None:
         worst = next(finding for finding in findings if finding.kind == "error")
         raise UserError(f"{source}: {worst}; `envtf data check` lists all that is wrong.")

@@ -7,7 +7,7 @@ of all members disagree, data were lacking.
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -184,25 +184,39 @@ class EnsembleDynamics(nn.Module):
         self, state: EnsembleState, action: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None
     ) -> tuple[EnsembleState, Prediction]:
         """See `WorldModel.step`. A sample follows one elite, drawn for each row at each step unless the row has one."""
-        outputs = self(self.normaliser.token(state.observation, action))  # each (M, B, S + 1)
+
+        def value(means: Tensor, log_variances: Tensor) -> Tensor:
+            return self._value(state, means, log_variances, mode, generator)
+
+        prediction = self.predict(state.observation, action, value)
+        return replace(state, observation=prediction.observation), prediction
+
+    def predict(self, observation: Tensor, action: Tensor, value: Callable[[Tensor, Tensor], Tensor]) -> Prediction:
+        """Observations (B, S) and actions (B, A) to a `Prediction`.
+
+        Args:
+            observation: acted upon.
+            action: taken.
+            value: the elites' means and log-variances (E, B, S + 1) to the outcome (B, S + 1), all in unit scale.
+        """
+        outputs = self(self.normaliser.token(observation, action))  # each (M, B, S + 1)
         epistemic = outputs[0].var(0, correction=0) if self.members > 1 else None
         means, log_variances = (output[self.elite] for output in outputs)  # (E, B, S + 1)
         mean, aleatoric = means.mean(0), log_variances.exp().mean(0)
         variance = aleatoric if epistemic is None else aleatoric + epistemic
-        value = self._value(state, means, log_variances, mode, generator)
-        outcome, scale = self.normaliser.outcome(state.observation, value), self.normaliser.target_std
-        density = -nll(means, log_variances, value.detach())  # (E, B)
-        prediction = Prediction(
+        chosen = value(means, log_variances)
+        outcome, scale = self.normaliser.outcome(observation, chosen), self.normaliser.target_std
+        density = -nll(means, log_variances, chosen.detach())  # (E, B)
+        return Prediction(
             observation=outcome[..., :-1],
             reward=outcome[..., -1],
-            mean=self.normaliser.outcome(state.observation, mean),
+            mean=self.normaliser.outcome(observation, mean),
             aleatoric=aleatoric.sqrt() * scale,
             epistemic=None if epistemic is None else epistemic.sqrt() * scale,
             uncertainty=self.normaliser.uncertainty(variance),
             novelty=None if epistemic is None else self.normaliser.uncertainty(epistemic).square() / self.limit,
             log_prob=density.logsumexp(0) - math.log(len(means)) - scale.log().sum(),
         )
-        return replace(state, observation=prediction.observation), prediction
 
     def _value(
         self,

@@ -147,11 +147,12 @@ class EnvironmentTransformer(nn.Module):
         *,
         mode: Mode = "mean",
         generator: torch.Generator | None = None,
+        noise: Tensor | None = None,
     ) -> Prediction:
         """Last hidden tokens (..., D) of pairs (..., S + A), as normalised, in states (..., S), to a `Prediction`.
 
         With drawn last layers (B, D + 1, S + 1) outcomes follow those, and differ by aleatoric noise alone; `log_prob`
-        is under the whole distribution nevertheless.
+        is under the whole distribution nevertheless. Standard normal `noise` (..., S + 1) stands in for a sample's.
         """
         scale = self.normaliser.target_std
         mean, log_variance, epistemic_log_variance = self.heads(hidden)
@@ -168,9 +169,10 @@ class EnvironmentTransformer(nn.Module):
         if drawn is not None:
             deviation = self._posterior().deviation(hidden.float(), drawn)
             value, spread = mean + deviation * self.recalibration.sqrt(), aleatoric
-        if mode == "sample":
-            noise = stretch(torch.empty_like(mean).normal_(generator=generator), self.tail)
-            value = value + spread.sqrt() * noise
+        if mode == "sample" and noise is None:
+            noise = torch.empty_like(mean).normal_(generator=generator)
+        if noise is not None:
+            value = value + spread.sqrt() * stretch(noise, self.tail)
         std = variance.sqrt()
         density = log_density((value.detach() - mean) / std, self.tail) - (std * scale).log()  # of each output
         outcome = self.normaliser.outcome(observation, value)

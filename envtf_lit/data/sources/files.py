@@ -57,12 +57,14 @@ class Raw:
         attributes: `task`, `action_low`, `action_high`, `held_out`, where there are such.
         ignored: names of everything else.
         broken: columns that are there and cannot be read, by our names, and why.
+        notes: what reading them changed.
     """
 
     columns: dict[str, Any] = field(default_factory=dict)
     attributes: dict[str, Any] = field(default_factory=dict)
     ignored: list[str] = field(default_factory=list)
     broken: dict[str, Finding] = field(default_factory=dict)
+    notes: list[Finding] = field(default_factory=list)
 
 
 def save_dataset(dataset: OfflineDataset, path: str | Path) -> None:
@@ -153,7 +155,9 @@ def is_hdf5(path: Path) -> bool:
     """
     ending = path.suffix.lower()
     if ending not in HDF5_ENDINGS + NPZ_ENDINGS:
-        raise UserError(f"{path} ends in {ending!r}: name a dataset .h5, .hdf5 or .npz.")
+        raise UserError(
+            f"{path} ends in {ending!r}: name a dataset .h5, .hdf5 or .npz, as `envtf data convert` writes it."
+        )
     return ending in HDF5_ENDINGS
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from envtf_lit.data.checks import build_dataset
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.sources.fetch import fingerprint
-from envtf_lit.data.sources.files import Raw, check_size, hdf5_bytes, open_raw, own_hdf5
+from envtf_lit.data.sources.files import Raw, check_size, hdf5_bytes, own_hdf5
 from envtf_lit.errors import UserError
 from envtf_lit.files import replacing
 from envtf_lit.robots.hidden_dynamics import HiddenDynamics
@@ -50,28 +50,12 @@ def read_minari(id_or_path: str | Path, *, task: str | None = None, download: bo
         UserError: there is no such dataset or it cannot be fetched, its observations or actions are not plain vectors,
             or it is damaged or does not fit the task.
     """
-    raw = _raw(id_or_path, download)
+    raw = minari_raw(id_or_path, download)
     return build_dataset(raw.columns, raw.attributes, task=task, source=f"The Minari dataset {id_or_path}")
 
 
-def open_source(source: str | Path) -> contextlib.AbstractContextManager[Raw]:
-    """What any dataset on this machine holds, as it lies there; its columns may be used inside the block alone.
-
-    Args:
-        source: an HDF5 or NPZ file, `minari:` and the id of a Minari dataset, or such a dataset's folder.
-
-    Raises:
-        UserError: there is nothing of that name, or it is none of these, damaged, or made to do harm.
-    """
-    name = str(source)
-    if name.startswith(MINARI):
-        return contextlib.nullcontext(_raw(name.removeprefix(MINARI), download=False))
-    if Path(source).is_dir():
-        return contextlib.nullcontext(_raw(source, download=False))
-    return open_raw(source)
-
-
-def _raw(id_or_path: str | Path, download: bool) -> Raw:
+def minari_raw(id_or_path: str | Path, download: bool) -> Raw:
+    """What a Minari dataset holds, as it lies there; arguments and errors are those of `read_minari`."""
     folder = _find(id_or_path, download)
     source = f"The Minari dataset {id_or_path}"
     with _explained(source):

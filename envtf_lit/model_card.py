@@ -1,0 +1,141 @@
+"""A trained model's card: what it is, what it learned from, how good it is, and what not to ask of it."""
+
+import json
+import math
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from envtf_lit.errors import UserError
+from envtf_lit.files import read_json
+from envtf_lit.policy import Actor, kind_of
+from envtf_lit.sharing import Model, load_model
+from envtf_lit.world_models.transformer import EnvironmentTransformer
+
+UNKNOWN = "unknown"  # the hub's word for a licence that nobody stated
+WHAT = {
+    "tanh_gaussian": "A stochastic policy, a squashed Gaussian, learned from a log of trajectories.",
+    "gaussian": "A stochastic policy, a Gaussian with a mean in the action space, learned from a log of trajectories.",
+    "deterministic": "A deterministic policy, learned from a log of trajectories.",
+    "environment_transformer": "A world model: a transformer that predicts next state and reward, and its uncertainty.",
+    "ensemble_dynamics": "A world model: an ensemble that predicts next state and reward, and its uncertainty.",
+}
+
+
+def model_card(folder: str | Path, *, report: str | Path | None = None, licence: str = UNKNOWN) -> str:
+    """The text of a model's card, with the hub's front matter.
+
+    Args:
+        folder: of a policy or a world model, whose `metrics.json` and `resolved.json` are read where there are such.
+        report: `reports/metrics.json` of the project; scores and calibration are of the model of the folder's name.
+        licence: the hub's name of it, such as `mit`.
+
+    Raises:
+        UserError: the folder holds no model, a file is not JSON, or the licence is no such name.
+    """
+    folder = Path(folder)
+    if not licence or not all(character.isalnum() or character in ".-" for character in licence):
+        raise UserError(f"{licence!r} names no licence: write it as the hub does, such as mit or apache-2.0.")
+    model, name = load_model(folder), folder.resolve().name
+    kind = kind_of(model) if isinstance(model, Actor) else str(read_json(folder / "config.json")["kind"])
+    found = _record(report)
+    tags = [
+        "reinforcement-learning",
+        "offline-reinforcement-learning",
+        *([] if isinstance(model, Actor) else ["world-model"]),
+    ]
+    front = {"library_name": "envtf_lit", "pipeline_tag": "reinforcement-learning", "license": licence, "tags": tags}
+    parts = [
+        "---\n" + "\n".join(f"{key}: {json.dumps(value)}" for key, value in front.items()) + "\n---",
+        f"# {name}\n\n{WHAT[kind]}",
+        f"```python\nimport envtf_lit\n\n{_use(model)}\n```",
+        *_section("Data", _data(found)),
+        *_section("Scores", _scores(model, name, found) | _numbers(_record(folder / "metrics.json"))),
+        *([] if isinstance(model, Actor) else _section("Calibration", _calibration(name, found))),
+        f"## Limits\n\n{_limits(model)}",
+        *_options(_record(folder / "resolved.json")),
+        *_section("Versions", {package: version(package) for package in ("envtf-lit", "torch")}),
+        "## Licence\n\n" + ("None was stated: ask whoever trained it." if licence == UNKNOWN else f"`{licence}`"),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _record(path: str | Path | None) -> dict[str, Any]:
+    """A JSON object, empty where there is no file."""
+    content = read_json(path) if path is not None and Path(path).is_file() else {}
+    if not isinstance(content, dict):
+        raise UserError(f"{path} holds no JSON object: write it anew.")
+    return content
+
+
+def _part(record: dict[str, Any], *names: str) -> dict[str, Any]:
+    for name in names:
+        inner = record.get(name)
+        record = inner if isinstance(inner, dict) else {}
+    return record
+
+
+def _numbers(record: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: value
+        for name, value in record.items()
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    }
+
+
+def _data(found: dict[str, Any]) -> dict[str, Any]:
+    task = found.get("task")
+    return ({"task": task} if isinstance(task, str) else {}) | _numbers(_part(found, "dataset"))
+
+
+def _scores(model: Model, name: str, found: dict[str, Any]) -> dict[str, Any]:
+    return _numbers(_part(found, "policies", name)) if isinstance(model, Actor) else {}
+
+
+def _calibration(name: str, found: dict[str, Any]) -> dict[str, Any]:
+    scored = _part(found, "world_model")
+    return _numbers(scored) if scored.get("name") == name else {}
+
+
+def _section(title: str, facts: dict[str, Any]) -> list[str]:
+    if not facts:
+        return [f"## {title}\n\nNot recorded beside this model."]
+    lines = [f"| {_cell(key)} | {_cell(value)} |" for key, value in facts.items()]
+    return ["\n".join([f"## {title}\n", "| | |", "|---|---|", *lines])]
+
+
+def _cell(value: Any) -> str:
+    """A number to four digits; text without what would end a cell, or begin a link or HTML."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "".join(character for character in str(value)[:100] if character.isalnum() or character in " _.,:+-/%")
+
+
+def _options(settings: dict[str, Any]) -> list[str]:
+    if not settings:
+        return []
+    text = json.dumps(settings, indent=2).replace("```", "")
+    return [f"## Settings\n\n```json\n{text}\n```"]
+
+
+def _use(model: Model) -> str:
+    if isinstance(model, Actor):
+        return 'policy = envtf_lit.load_policy("FOLDER")\naction = policy.act(observation)  # (B, S) to (B, A)'
+    return 'model = envtf_lit.load_world_model("FOLDER")\nstate, prediction = model.step(state, action)'
+
+
+def _limits(model: Model) -> str:
+    if isinstance(model, Actor):
+        S, A = len(model.observation_mean), len(model.action_low)
+        low, high = ([round(x, 6) for x in limit.tolist()] for limit in (model.action_low, model.action_high))
+        return (
+            f"{S} observation and {A} action dimensions; actions from {low} to {high}. It knows the states of its log: "
+            "elsewhere its actions are extrapolation, and nothing in it says so. Try it in a simulator, or within the "
+            "limits of a safety layer, before a robot obeys it."
+        )
+    memory = f"It sees the last {model.options.context} steps. " if isinstance(model, EnvironmentTransformer) else ""
+    return (
+        f"{model.observation_dim} observation and {model.action_dim} action dimensions. {memory}Predictions hold where "
+        "data were: a `novelty` above 1 says that they were not, and rollouts should end there. Errors add up over an "
+        "open loop."
+    )
