@@ -63,11 +63,12 @@ COMMANDS = {
         _KEPT,
     ),
     "bench model": Command("studies", "Imagination and training, against ensemble, simulator and matrix product"),
+    "bench agents": Command("studies", "The agents' updates on a CPU, against d3rlpy, and without Lightning"),
     "bench cost": Command("studies", "Training to equal held-out error: transformer, ensemble, plain network", _KEPT),
     "doctor": Command("project", "Print versions, threads, GL, disk and GPU for a bug report"),
 }
 GROUPS = {
     "data": "Check a dataset, or convert it to another format",
     "zoo": "Datasets of four robots from behaviour policies that come along: list, build, or train your own",
-    "bench": "Measure the world model's speed and what its accuracy costs, beside what it would replace",
+    "bench": "Measure the speed of world model and agents and what accuracy costs, beside what they would replace",
 }
