@@ -86,8 +86,8 @@ def bench_agents(
     counts = {name: updates // cost for name, cost in COST.items()}
     with tempfile.TemporaryDirectory() as folder:
         log = _write_log(Path(folder))
-        sides = {f"{name}_fp32": _ours(log, name, counts[name], "fp32") for name in OPTIONS}
-        sides["cql_bf16"] = _ours(log, "cql", counts["cql"], "bf16")
+        both: tuple[Precision, ...] = ("fp32", "bf16")
+        sides = {f"{name}_{one}": _ours(log, name, counts[name], one) for name in OPTIONS for one in both}
         sides["default"] = _ours(log, "default", updates, "bf16")
         sides["bare"] = _bare(log, "default", updates, "bf16")
         sides |= _stacks(NETS["hidden"], NETS["batch_size"])
@@ -104,13 +104,14 @@ def bench_agents(
 
 
 def _ratios(timings: list[dict[str, float]], *, their: bool) -> dict[str, float | None]:
-    def against(name: str, precision: Precision = "fp32") -> float | None:
+    def against(name: str, precision: Precision = "fp32") -> float | None:  # d3rlpy has no other than fp32
         return ratio(timings, f"{name}_d3rlpy", f"{name}_{precision}") if their else None
 
     return {
         "cql_vs_d3rlpy_fp32": against("cql"),
         "cql_vs_d3rlpy_bf16": against("cql", "bf16"),
-        **{f"{name}_vs_d3rlpy": against(name) for name in ("iql", "td3_bc", "rebrac")},
+        **{f"{name}_vs_d3rlpy": against(name, "bf16") for name in ("iql", "td3_bc", "rebrac")},
+        **{f"{name}_vs_d3rlpy_fp32": against(name) for name in ("iql", "td3_bc", "rebrac")},
         "stacked_seeds_ratio": ratio(timings, "one_after_another", "stacked"),
         "lightning_share": 1.0 - ratio(timings, "bare", "default"),
     }
@@ -257,7 +258,9 @@ def their_side(python: Path | None, log: Path, threads: int) -> Iterator[tuple[d
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=log.parent
         )
     except OSError as error:
-        raise UserError(f"{python} cannot be run ({error.strerror}): give the Python of d3rlpy's environment.") from None
+        raise UserError(
+            f"{python} cannot be run ({error.strerror}): give the Python of d3rlpy's environment."
+        ) from None
     with process:
         assert process.stdin is not None and process.stdout is not None
         stdin, stdout = process.stdin, process.stdout
