@@ -142,10 +142,13 @@ def _write_log(folder: Path) -> Path:
     return path
 
 
-def write_plain(dataset: OfflineDataset, path: Path) -> None:
-    """The columns that the other side reads."""
+def write_plain(dataset: OfflineDataset, path: Path, *, scaled: bool = False) -> None:
+    """The columns that the other side reads; observations z-scored if wanted, as our networks do themselves."""
     flags = {"terminals": dataset.terminated, "timeouts": dataset.truncated & ~dataset.terminated}
     wide = {name: np.asarray(getattr(dataset, name)[:]) for name in ("observations", "actions", "rewards")}
+    if scaled:
+        mean, std = (scale.numpy() for scale in dataset.observation_scale())
+        wide["observations"] = (wide["observations"] - mean) / std
     np.savez(path, allow_pickle=False, **wide, **{name: flag.astype(np.float32) for name, flag in flags.items()})
 
 

@@ -1,9 +1,9 @@
 """d3rlpy's side of a comparison: a process in an environment of its own, which has d3rlpy and not this package.
 
-`PYTHON d3rlpy_worker.py LOG.npz THREADS` reads one JSON line a job from its standard input and answers each by one, after
-a first line with d3rlpy's version. A job is `{"name": …, "seed": …, "updates": …}`: so many updates of the algorithm of
-that name and seed, by d3rlpy's own `fit`, on the rows of the log; with `"save": FILE.npz` its actor lies there
-afterwards: weights and biases of the layers whose tanh is the action. The answer is `{"seconds": …}`.
+`PYTHON d3rlpy_worker.py LOG.npz THREADS` reads one JSON line a job from its standard input and answers each by one,
+after a first line with d3rlpy's version. A job is `{"name": …, "seed": …, "updates": …}`: so many updates of the
+algorithm of that name and seed, by d3rlpy's own `fit`, on the rows of the log; with `"save": FILE.npz` its actor lies
+there afterwards: weights and biases of the layers whose tanh is the action. The answer is `{"seconds": …}`.
 """
 
 import json
