@@ -328,4 +328,5 @@ class Agent(L.LightningModule, ABC):
 @torch.no_grad()
 def follow(follower: nn.Module, leader: nn.Module, rate: float) -> None:
     """Moves every parameter by this share of the way to the leader's."""
-    torch._foreach_lerp_(list(follower.parameters()), list(leader.parameters()), rate)
+    move = torch._foreach_lerp_  # pyright: ignore[reportPrivateImportUsage]
+    move(list(follower.parameters()), list(leader.parameters()), rate)
