@@ -1,6 +1,7 @@
 """`envtf bench`: the keys that others read, on budgets of seconds, and what the figures rest on."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,10 @@ import torch
 from envtf_lit.cli.main import main
 from envtf_lit.cli.signatures import parse_words
 from envtf_lit.cli.studies import bench_cost as bench_cost_command
+from envtf_lit.errors import UserError
 from envtf_lit.robots.tasks import ROBOTS
+from envtf_lit.studies import agent_speed
+from envtf_lit.studies.agent_speed import OPTIONS, bench_agents, their_side
 from envtf_lit.studies.cost import _plain, bench_cost
 from envtf_lit.studies.machine import in_turns, ratio, typical
 from envtf_lit.studies.speed import _training, bench_model
@@ -47,6 +51,31 @@ def test_the_speed_file_is_flat_and_has_the_named_keys(tmp_path: Path) -> None:
     assert all(isinstance(result[name], float) and result[name] > 0 for name in RATIOS)
     assert not any(isinstance(value, dict | list) for value in result.values())
     assert {"device", "threads", "precision", "torch", "mujoco", "load_average", "seed"} <= result.keys()
+
+
+def test_the_agents_speed_is_measured_without_d3rlpy_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(agent_speed.NETS, "hidden", (8, 8, 8))
+    monkeypatch.setitem(agent_speed.NETS, "batch_size", 8)
+    monkeypatch.setitem(agent_speed.COST, "cql", 1)
+    out = tmp_path / "agents.json"
+    result = bench_agents(out, updates=10, rounds=1)
+    assert json.loads(out.read_text()) == result
+    against = [name for name in result if "_vs_d3rlpy" in name]
+    assert len(against) == 8 and all(result[name] is None for name in against)
+    rates = [result[f"{name}_{one}_updates_per_second"] for name in OPTIONS for one in ("fp32", "bf16")]
+    assert min(*rates, result["default_updates_per_second"], result["stacked_seeds_ratio"]) > 0
+    assert result["lightning_share"] < 1
+
+
+def test_a_python_without_d3rlpy_is_refused(tmp_path: Path) -> None:
+    for python, words in ((tmp_path / "python", "cannot be run"), (Path(sys.executable), "has no d3rlpy")):
+        with pytest.raises(UserError, match=words), their_side(python, tmp_path / "log.npz", 1):
+            pass
+
+
+def test_an_odd_number_of_updates_is_refused() -> None:
+    with pytest.raises(UserError, match="--updates is 30: take a multiple of 100"):
+        bench_agents(updates=30)
 
 
 def test_rounds_take_turns_and_the_first_warms_up() -> None:

@@ -15,6 +15,7 @@ MARKS = {
     "horizon": "measured.trajectories",
     "calibrate": "calibration.points",
     "bench model": "train_fraction_of_matmul_peak",
+    "bench agents": "default_updates_per_second",
     "bench cost": "target_error",
 }
 BESIDE = {

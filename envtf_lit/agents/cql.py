@@ -72,10 +72,11 @@ class CQL(SAC):
         B, A, N = len(batch["rewards"]), self.action_dim, self.options.sampled_actions
         low, high = self.actor.action_low, self.actor.action_high
         uniform = low + (high - low) * torch.rand(B, N, A, generator=self.generator, device=low.device)
-        now, now_density = self.actor.sample(batch["observations"], N, generator=self.generator)
-        later, later_density = self.actor.sample(batch["following_observations"], N, generator=self.generator)
+        states = torch.stack([batch["observations"], batch["following_observations"]], 1).flatten(0, 1)
+        drawn, density = self.actor.sample(states, N, generator=self.generator)  # (2B, N, A): now, later, now, …
         uniform_density = torch.full((B, N), -A * math.log(2.0), device=low.device)  # on the squashed range [-1, 1]
-        return torch.cat([uniform, now, later], 1), torch.cat([uniform_density, now_density, later_density], 1)
+        actions = torch.cat([uniform, drawn.reshape(B, 2 * N, A)], 1)
+        return actions, torch.cat([uniform_density, density.reshape(B, 2 * N)], 1)
 
     def pushed_down(self, q_proposed: Tensor, log_density: Tensor) -> Tensor:
         """(n, B) `T log mean exp(Q(s, a_j) / T - log p_j)`: the soft maximum of Q, `T log integral exp(Q(s, a) / T) da`

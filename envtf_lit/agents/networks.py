@@ -59,17 +59,18 @@ class StackedCritics(nn.Module):
         scaled = (observation - self.observation_mean) / self.observation_std
         state_part = self.from_observation(scaled.expand(self.n, -1, -1))  # (n, B, H)
         action_part = self.from_action(action.reshape(B * N, -1).expand(self.n, -1, -1))  # (n, B*N, H)
-        x = (state_part.unsqueeze(2) + action_part.unflatten(1, (B, N))).flatten(1, 2)  # (n, B*N, H)
-        x = self._activate(x)
+        x = self._activate(state_part.unsqueeze(2) + action_part.unflatten(1, (B, N))).flatten(1, 2)  # (n, B*N, H)
         for layer in self.hidden:
             x = self._activate(layer(x))
         q = in_fp32(self.out, x)[..., 0]  # (n, B*N)
         return q.view(self.n, B, N) if action.dim() == 3 else q
 
     def _activate(self, x: Tensor) -> Tensor:
+        """In place on a tensor of its own: of a view, autograd would copy the whole."""
         if self.layer_norm:  # without gain and shift: a rectifier follows, so no later layer could make up for a shift
-            x = F.layer_norm(x, x.shape[-1:])
-        return F.relu(x)
+            with torch.autocast(x.device.type, enabled=False):  # sums in fp32 anyway; the next product takes bf16
+                x = F.layer_norm(x, x.shape[-1:])
+        return F.relu(x, inplace=True)
 
 
 class PlainStateValue(nn.Module):

@@ -63,6 +63,7 @@ COMMANDS = {
         _KEPT,
     ),
     "bench model": Command("studies", "Imagination and training, against ensemble, simulator and matrix product"),
+    "bench agents": Command("studies", "The agents' updates on a CPU, against d3rlpy, and without Lightning"),
     "bench cost": Command("studies", "Training to equal held-out error: transformer, ensemble, plain network", _KEPT),
     "bench planning": Command(
         "planning", "Planners on a pendulum: through a model learned from random steps, and through the truth", _KEPT
@@ -83,5 +84,5 @@ GROUPS = {
     "zoo": "Datasets of four robots from behaviour policies that come along: list, build, or train your own",
     "export": "Write a policy or a world model as a file that runs without this package",
     "policy": "Ask a policy for actions",
-    "bench": "Measure the world model's speed and what its accuracy costs, beside what it would replace",
+    "bench": "Measure the speed of world model and agents and what accuracy costs, beside what they would replace",
 }

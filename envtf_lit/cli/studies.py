@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 Models = Annotated[tuple[str, ...], "NAME=FOLDER"]
 Device = Annotated[str, "NAME"]
+Program = Annotated[Path, "PYTHON"]
 
 ROBOTS: tuple[Robot, ...] = ("hopper", "halfcheetah", "walker2d", "ant")
 
@@ -201,6 +202,30 @@ def bench_model(
     console().print_json(data=result)
 
 
+def bench_agents(
+    *,
+    d3rlpy: Program | None = None,
+    updates: Positive = 100,
+    rounds: Positive = 5,
+    threads: Positive = 1,
+    out: File | None = None,
+) -> None:
+    """Measures the speed of the agents' updates on a CPU.
+
+    Args:
+        d3rlpy: of an environment with d3rlpy, made by `python -m venv .d3rlpy` and `.d3rlpy/bin/python -m pip install
+            -r benchmarks/d3rlpy/requirements.txt`; without it the ratios against d3rlpy are null.
+        updates: of each algorithm in a round, a multiple of 100; CQL with ten sampled actions takes a tenth of them.
+        rounds: of which medians are reported.
+        threads: CPU threads of either side.
+        out: JSON.
+    """
+    from envtf_lit.studies import agent_speed
+
+    result = agent_speed.bench_agents(out, d3rlpy=d3rlpy, updates=updates, rounds=rounds, threads=threads)
+    console().print_json(data=result)
+
+
 def bench_cost(*, task: str = "hopper-medium-replay", training: Training = SHORT, out: File | None = None) -> None:
     """Measures what the world model's accuracy costs.
 
@@ -220,6 +245,7 @@ FUNCTIONS = {
     "horizon": horizon,
     "calibrate": calibrate,
     "bench model": bench_model,
+    "bench agents": bench_agents,
     "bench cost": bench_cost,
 }
 
