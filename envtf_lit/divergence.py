@@ -61,16 +61,20 @@ def check_epoch(
 def unsound(tensors: Mapping[str, Tensor], parameters: Collection[str]) -> tuple[str, float] | None:
     """The first tensor that no sound training leaves, and a value of it that shows that; None where there is none.
 
-    Parameters are finite, no other tensor is NaN, and standard deviations, by their name, are finite and above zero.
+    Parameters are finite, no buffer is NaN, and those that are standard deviations, by their name, are finite and
+    above zero.
 
     Args:
         tensors: a module's state, by name.
         parameters: which of them are learned.
     """
     for name, tensor in tensors.items():
-        broken = ~tensor.isfinite() if name in parameters else tensor.isnan()
-        if name.rpartition(".")[2].rpartition("_")[2] == "std":
+        if name in parameters:
+            broken = ~tensor.isfinite()
+        elif name.rpartition(".")[2].rpartition("_")[2] == "std":
             broken = ~((tensor > 0) & tensor.isfinite())
+        else:
+            broken = tensor.isnan()
         if broken.any():
             return name, float(tensor[broken][0])
     return None

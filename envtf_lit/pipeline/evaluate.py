@@ -57,7 +57,8 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         _, held_out = held_out.validation_and_test()
         scale = Scale.of(training)
         report = horizon_report(model, whole_episodes(held_out, options.trajectories, seed=params.seed), scale)
-        policies = {policy: load_policy(root / POLICIES / policy) for policy in params.train_policy}
+        folders = {policy: root / POLICIES / policy for policy in params.train_policy}
+        policies = {policy: load_policy(place, guarded=robot is not None) for policy, place in folders.items()}
         curves = {policy: _curves(root / POLICIES / policy) for policy in policies}
         facts: dict[str, Any] = dict(
             seed=params.seed,
