@@ -12,9 +12,10 @@ from torch.overrides import TorchFunctionMode
 
 from envtf_lit.divergence import OVERFLOW, diverged, unsound
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.files import read_json, recover, replacing, write_json
+from envtf_lit.files import check_plain, read_json, recover, replacing, write_json
 
 M = TypeVar("M", bound=nn.Module)
+MOST_HEADER = 4 << 20  # bytes of a weights' file that name its tensors; those of this package have thousands
 CALLS_PER_TENSOR = 100  # of torch in a constructor; those of this package make about ten
 
 
@@ -114,6 +115,11 @@ def load_weights(module: nn.Module, path: str | Path) -> None:
 def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """Names and shapes of the tensors in a safetensors file, from its header."""
     try:
+        check_plain(path)
+        with path.open("rb") as stream:
+            length = int.from_bytes(stream.read(8), "little")
+        if length > MOST_HEADER:  # the library would take a thousand million names
+            raise SafetensorError(f"its header is of {length:,} bytes")
         with safe_open(path, framework="pt") as file:
             return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118 (no mapping)
     except FileNotFoundError:

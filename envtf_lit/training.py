@@ -200,10 +200,10 @@ def _checkpoint(run: Path, names: Sequence[str]) -> Path | None:
 
 
 def _readable(checkpoint: Path) -> bool:
+    if not checkpoint.is_file():  # or a pipe, which would never end
+        return False
     try:
         return "state_dict" in torch.load(checkpoint, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        return False
     except (OSError, MemoryError):  # says nothing about the file
         raise
     except Exception:  # whatever unpickling raises
