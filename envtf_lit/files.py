@@ -23,6 +23,7 @@ _MADE = re.compile(r"\.(.+)\.(\w+)-(\d+)-[0-9a-f]{8}\.(partial|old)", re.DOTALL)
 _IN_USE = set[str]()  # those of this process
 _LONGEST = 100  # bytes of a name that are kept in one of these; most file systems allow 255 in all
 _FOREIGN = 7 * 24 * 3600.0  # seconds after which what another machine left is taken for forgotten
+MOST_JSON = 32 << 20  # bytes; a horizon report, the longest that we write, has a few
 _TRIES = 10  # at taking a folder's place, while others take it too
 
 
@@ -252,16 +253,37 @@ def write_json(path: str | Path, content: Any) -> None:
     write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
+def check_plain(path: str | Path, most: int | None = None) -> None:
+    """Refuses what would block who reads it, or never end: a pipe, a device, a text far longer than ours are.
+
+    Args:
+        path: of the file.
+        most: bytes; None for any number.
+
+    Raises:
+        UserError: it is no file, or a longer one.
+        FileNotFoundError: there is none.
+    """
+    found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):
+        raise UserError(f"{path} is not a file, but a folder, a pipe or a device: give a file.")
+    if most is not None and found.st_size > most:
+        raise UserError(f"{path} has {found.st_size:,} bytes, and such a file has at most {most:,}: give another one.")
+
+
 def read_json(path: str | Path) -> Any:
     """Reads a JSON file.
 
     Raises:
-        UserError: the file is missing or is not JSON.
+        UserError: the file is missing, is not JSON, or has more than `MOST_JSON` bytes.
     """
     path = Path(path)
     try:
+        check_plain(path, MOST_JSON)
         return json.loads(path.read_text())
     except FileNotFoundError:
         raise UserError(f"{path} does not exist: check the path, or run the stage that writes it.") from None
+    except UserError:
+        raise
     except (ValueError, RecursionError) as error:  # the latter of brackets in brackets, the former of a long number too
         raise UserError(f"{path} is not valid JSON ({error}): write it anew.") from None

@@ -10,10 +10,12 @@ from safetensors.torch import load_file, save
 from torch import nn
 from torch.overrides import TorchFunctionMode
 
+from envtf_lit.divergence import OVERFLOW, diverged, unsound
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.files import read_json, recover, replacing, write_json
+from envtf_lit.files import check_plain, read_json, recover, replacing, write_json
 
 M = TypeVar("M", bound=nn.Module)
+MOST_HEADER = 4 << 20  # bytes of a weights' file that name its tensors; those of this package have thousands
 CALLS_PER_TENSOR = 100  # of torch in a constructor; those of this package make about ten
 
 
@@ -22,7 +24,13 @@ def save_module(folder: str | Path, module: nn.Module, *, kind: str, arguments: 
 
     No metadata goes into the safetensors file: several keys are written in random order, and equal weights must give
     equal bytes.
+
+    Raises:
+        UserError: the module is what no sound training leaves (see `unsound`); nothing is written then.
     """
+    found = unsound(module.state_dict(), dict(module.named_parameters()))
+    if found is not None:
+        raise diverged(f"What {folder} shall hold, the {kind},", "in its training", *found, OVERFLOW)
     with replacing(folder) as temporary:
         temporary.mkdir()
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in module.state_dict().items()}
@@ -37,7 +45,7 @@ def load_module(folder: str | Path, registry: Mapping[str, type[M]]) -> M:
 
     Raises:
         UserError: no such folder, an unknown kind, arguments the class does not take, or weights that are damaged, of
-            another shape, or not finite.
+            another shape, or not sound.
     """
     folder = Path(folder)
     recover(folder)
@@ -91,24 +99,27 @@ def load_weights(module: nn.Module, path: str | Path) -> None:
     """Fills `module` from a safetensors file.
 
     Raises:
-        UserError: the file is missing, damaged, or holds other names or shapes than the module, or a parameter that is
-            not finite, or a buffer that is NaN.
+        UserError: the file is missing, damaged, or holds other names or shapes than the module, or what no sound
+            training leaves (see `unsound`).
     """
     path = Path(path)
     _compare(module, _shapes(path), path)
     tensors = load_file(path)
     module.load_state_dict(tensors)
-    parameters = dict(module.named_parameters())
-    for name, tensor in tensors.items():
-        broken = ~tensor.isfinite() if name in parameters else tensor.isnan()
-        if broken.any():
-            value = float(tensor[broken][0])
-            raise UserError(f"{path} holds {value} in {name}: the training that wrote it diverged, so train it anew.")
+    found = unsound(tensors, dict(module.named_parameters()))
+    if found is not None:
+        name, value = found
+        raise UserError(f"{path} holds {value} in {name}: the training that wrote it diverged, so train it anew.")
 
 
 def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """Names and shapes of the tensors in a safetensors file, from its header."""
     try:
+        check_plain(path)
+        with path.open("rb") as stream:
+            length = int.from_bytes(stream.read(8), "little")
+        if length > MOST_HEADER:  # the library would take a thousand million names
+            raise SafetensorError(f"its header is of {length:,} bytes")
         with safe_open(path, framework="pt") as file:
             return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118 (no mapping)
     except FileNotFoundError:

@@ -333,8 +333,14 @@ def save_policy(folder: str | Path, actor: Actor) -> None:
     save_module(folder, actor, kind=kind_of(actor), arguments=actor.arguments)
 
 
-def load_policy(folder: str | Path) -> Actor:
+def load_policy(folder: str | Path, *, guarded: bool = True) -> Actor:
     """The policy saved in a folder, ready to `act`.
+
+    Args:
+        folder: that `save_policy` wrote.
+        guarded: it refuses observations that are not finite, in `act` too, with a UserError: a robot whose sensor fails
+            must not be sent NaN. That takes one look at the device for each call, so a world model's own states, which
+            end their rollouts where they aren't finite, come without. Nor is it in what `torch.export` or a trace make.
 
     Raises:
         UserError: the folder is missing, damaged, or holds something that is not a policy, or one whose action limits
@@ -347,4 +353,20 @@ def load_policy(folder: str | Path) -> Actor:
             f"{folder} holds action limits {actor.action_low.tolist()} and {actor.action_high.tolist()}: each low one "
             "must be less than its high one, and both finite; train the policy on data that say so."
         )
+    if guarded:
+        actor.register_forward_pre_hook(_refuse_unknown)
     return actor
+
+
+def _refuse_unknown(actor: nn.Module, given: tuple[Tensor, ...]) -> None:
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():  # a graph raises nothing
+        return
+    observation = given[0]
+    if observation.isfinite().all():
+        return
+    odd = (~observation.isfinite()).nonzero()[0]
+    dimension, value = int(odd[-1]), float(observation[tuple(odd)])
+    raise UserError(
+        f"A policy is asked for an action where dimension {dimension} of the observation is {value}: the action would "
+        "be no number; look why the sensor or the simulator gives none, and stop the robot there."
+    )

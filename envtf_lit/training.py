@@ -20,6 +20,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from rich.console import Console
 from torch import nn
 
+from envtf_lit.divergence import CURES, check_epoch
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import check_writable, replacing, write_json
 from envtf_lit.options.schema import Precision
@@ -78,6 +79,19 @@ class Curves(Checkpoint):
             writer.writerows(self.rows)
 
 
+class Guard(Checkpoint):
+    """Stops a training at the end of an epoch that diverged; see `check_epoch`.
+
+    A `Checkpoint` by type alone, to be called after the module, and in front of those that write: nothing of that epoch
+    is kept. A module may have a `label`, and `cures` of its own.
+    """
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        label = getattr(pl_module, "label", type(pl_module).__name__)
+        cures = getattr(pl_module, "cures", CURES)
+        check_epoch(trainer.callback_metrics, pl_module, label, trainer.current_epoch + 1, cures)
+
+
 class WholeCheckpoints(TorchCheckpointIO):
     """Leaves the old checkpoint or the new one, whatever happens meanwhile: Lightning's own way may copy in place."""
 
@@ -128,7 +142,7 @@ def trained(
         callbacks: further ones.
 
     Raises:
-        UserError: `target` or `run` cannot be written, before any training.
+        UserError: `target` or `run` cannot be written, before any training; or the training diverged.
     """
     if target is not None:
         check_writable(target, folder=True)
@@ -160,12 +174,15 @@ def trained(
 
 
 def _keepers(run: Path, curves: Curves, monitor: str | None, mode: Literal["min", "max"]) -> list[Callback]:
-    """What writes `best.ckpt`, if there is something to monitor, and `last.ckpt`, which must hold the others' state."""
+    """What writes `best.ckpt`, if there is something to monitor, and `last.ckpt`, which must hold the others' state.
+
+    In front the guard: an epoch that diverged is in neither.
+    """
     last = ModelCheckpoint(dirpath=run, filename="last", enable_version_counter=False)
     if monitor is None:
-        return [curves, last]
+        return [Guard(), curves, last]
     best = ModelCheckpoint(dirpath=run, filename="best", monitor=monitor, mode=mode, enable_version_counter=False)
-    return [best, curves, last]
+    return [Guard(), best, curves, last]
 
 
 def _checkpoint(run: Path, names: Sequence[str]) -> Path | None:
@@ -187,10 +204,10 @@ def _checkpoint(run: Path, names: Sequence[str]) -> Path | None:
 
 
 def _readable(checkpoint: Path) -> bool:
+    if not checkpoint.is_file():  # or a pipe, which would never end
+        return False
     try:
         return "state_dict" in torch.load(checkpoint, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        return False
     except (OSError, MemoryError):  # says nothing about the file
         raise
     except Exception:  # whatever unpickling raises

@@ -104,3 +104,22 @@ def test_the_deterministic_actor_measures_distance_in_shares_of_its_range() -> N
     actor, observation = make_actor(DeterministicActor, **LIMITS), torch.randn(B, S)
     off = actor.act(observation) + torch.tensor([0.2, 0.05])  # a tenth of half the range, and a fifth
     torch.testing.assert_close(actor.clone_error(observation, off), torch.full((B,), (0.1**2 + 0.2**2) / 2))
+
+
+@KINDS
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_no_action_is_given_for_what_no_sensor_measures(cls: type[Actor], value: float, tmp_path: Path) -> None:
+    """A saved policy acts on robots; in a world model's imagination it may be loaded without that look."""
+    save_policy(tmp_path / "policy", make_actor(cls))
+    observation = torch.zeros(B, S)
+    actor = load_policy(tmp_path / "policy")
+    assert actor.act(observation).isfinite().all()
+    observation[4, 1] = value
+    with pytest.raises(UserError, match=f"dimension 1 of the observation is {value}: .* stop the robot there"):
+        actor.act(observation)
+    with pytest.raises(UserError, match="dimension 1"):
+        actor.act(observation[4:5], deterministic=False)
+    unguarded = load_policy(tmp_path / "policy", guarded=False)
+    assert not unguarded.act(torch.full((1, S), math.nan)).isfinite().any()
+    graph = torch.export.export(actor, (observation,))  # which cannot raise
+    assert "isfinite" not in str(graph.graph)

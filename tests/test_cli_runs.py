@@ -1,14 +1,17 @@
 """`envtf` at work: what its commands write, and signals, full disks and missing back ends that come in between."""
 
+import contextlib
 import hashlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -72,6 +75,79 @@ def test_a_pool_does_not_hold_up_a_termination(tmp_path: Path) -> None:
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 143
     assert "envtf: Interrupted. The same command begins anew." in errors.splitlines()
+
+
+LISTED = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are listed there")
+
+
+def children(process: int) -> set[int]:
+    """Numbers of the processes that it started, and that these started, by the kernel's own list."""
+    direct = {
+        int(word) for task in Path(f"/proc/{process}/task").glob("*/children") for word in task.read_text().split()
+    }
+    return direct.union(*map(children, direct))
+
+
+def is_alive(process: int) -> bool:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+def wait_until_none_lives(processes: set[int]) -> None:
+    deadline = time.monotonic() + 30
+    while any(map(is_alive, processes)):
+        assert time.monotonic() < deadline, "a worker is left"
+        time.sleep(0.02)
+
+
+POOL = """
+import concurrent.futures, multiprocessing, time
+from envtf_lit.workers import end_with_parent
+
+if __name__ == "__main__":
+    with concurrent.futures.ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), end_with_parent) as pool:
+        waiting = [pool.submit(time.sleep, 600) for _ in range(2)]
+        while not all(future.running() for future in waiting):
+            time.sleep(0.01)
+        print("ready", flush=True)
+        waiting[0].result()
+"""
+
+
+@LISTED
+def test_workers_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "pool.py").write_text(POOL)
+    quiet: dict[str, Any] = dict(stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    with subprocess.Popen([sys.executable, "pool.py"], cwd=tmp_path, **quiet) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        workers = children(process.pid)
+        assert len(workers) >= 2 and all(map(is_alive, workers))
+        process.kill()
+    wait_until_none_lives(workers)
+
+
+def is_collecting(process: int) -> bool:
+    """Whether a worker has begun: then it has MuJoCo in its memory; the tracker never does."""
+    maps = Path(f"/proc/{process}/maps").read_text() if is_alive(process) else ""
+    command = Path(f"/proc/{process}/cmdline").read_text() if is_alive(process) else ""
+    return "resource_tracker" in command or "libmujoco" in maps
+
+
+@LISTED
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_no_worker_outlives_a_download(number: int, project: Path) -> None:
+    """Killed, it can tell them nothing; the kernel's own killer does not ask either."""
+    command = [sys.executable, "-m", "envtf_lit", "download", "--quiet", "--threads=2", "--download.transitions=400000"]
+    process = subprocess.Popen(command, cwd=project, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while len(found := children(process.pid)) < 3 or not all(map(is_collecting, found)):  # two, and Python's tracker
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(number)
+    process.wait(timeout=30)
+    wait_until_none_lives(found)
 
 
 def test_an_output_that_is_not_utf8_shows_stand_ins(tiny_download: Path) -> None:

@@ -1,6 +1,7 @@
 """`envtf data check` and `envtf data convert`: what is allowed and probably not meant, the report, the exit status."""
 
 import io
+import re
 from pathlib import Path
 
 import h5py
@@ -83,9 +84,9 @@ def test_constant_dimensions_and_rewards():
 def test_huge_values():
     dataset = walker_dataset()
     observations = np.array(dataset.observations)
-    observations[7, 4] = -3e38
+    observations[7, 4] = -3e18
     text = said(dataset, observations=observations, rewards=1e9 * dataset.rewards)
-    assert "'observations' reach a magnitude of 3e+38 in dimension 4" in text
+    assert "'observations' reach a magnitude of 3e+18 in dimension 4" in text
     assert "'rewards' reach a magnitude of" in text
 
 
@@ -250,3 +251,32 @@ def test_a_converted_file_names_its_task(tmp_path: Path):
         del file.attrs["task"]
     convert(str(tmp_path / "in.h5"), str(tmp_path / "out.h5"), task="hopper-medium")
     assert load_dataset(tmp_path / "out.h5").task == "hopper-medium"
+
+
+def test_one_wild_value_is_named_with_its_place():
+    """By the spread of all others: a standard deviation would be the wild value's own."""
+    dataset = walker_dataset()
+    observations, rewards = np.array(dataset.observations), np.array(dataset.rewards)
+    observations[27, 4], observations[45:47, 6] = 4e3, -5e6
+    rewards[100] = 2e7
+    text = said(dataset, observations=observations, rewards=rewards)
+    assert re.search(r"'observations' is 4000 in dimension 4 at row 27, \S+ times the spread away", text)
+    assert "'observations' is -5e+06 in dimension 6 at row 45," in text and "(2 rows are as far)" in text
+    assert re.search(r"'rewards' is 2e\+07 at row 100, .*drop episode 5 \(rows 100 to 119\): else it sets", text)
+    assert text.count("times the spread") == 3
+
+
+def test_sound_values_are_not_called_wild():
+    """Whatever their unit, however rarely a dimension moves, and where heavy tails are its nature."""
+    dataset = walker_dataset(100)
+    random = np.random.default_rng(0)
+    observations = np.array(dataset.observations)
+    observations[:, 1] = random.standard_t(2, len(observations))
+    observations[:, 2], observations[3, 2] = 0.0, 1.0  # moves once
+    observations[:, 3] = (random.random(len(observations)) < 0.03) * 1e-9
+    observations[:, 4] = 7.0
+    observations[:, 5] *= 1e9
+    text = said(dataset, observations=observations)
+    assert "times the spread" not in text
+    observations[9, 4] = 1e5  # beside a constant
+    assert "'observations' is 1e+05 in dimension 4 at row 9" in said(dataset, observations=observations)

@@ -136,6 +136,33 @@ def test_a_connection_that_always_breaks_at_the_same_place_ends(serve: Serve, tm
     assert len(here.asked) == 1 + ATTEMPTS
 
 
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("http://[::1", "http://a..b/x", "http:///x", "ftp://127.0.0.1/x", "http://127.0.0.1:99999/x", "http://*x/"),
+        *("\u00ff:", f"http://{'a' * 300}/x", "file:///etc/passwd", "http://127.0.0.1:9x/"),
+    ],
+)
+def test_a_redirect_to_what_is_no_address_ends(serve: Serve, tmp_path: Path, address: str) -> None:
+    here = serve(server(redirect=address))
+    with pytest.raises(UserError, match=r"^Cannot download some\.hdf5: http://127\.0\.0\.1:\d+/some\.hdf5 \S+ "):
+        get(remote(here), tmp_path / "some.hdf5")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_server_that_drips_is_given_up_and_the_next_one_continues(
+    serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("envtf_lit.data.sources.fetch.WINDOW", 0.2)
+    drips, sound = serve(server(pause=0.02)), serve(server())
+    with pytest.raises(UserError, match=r"sends \d+(\.\d+)? bytes a second, and less than 1,000 is no use"):
+        get(remote(drips), tmp_path / "some.hdf5")
+    get(remote(drips, sound), tmp_path / "some.hdf5")
+    assert (tmp_path / "some.hdf5").read_bytes() == CONTENT
+    (asked,) = sound.asked
+    assert asked is not None and 0 < int(asked.removeprefix("bytes=").removesuffix("-")) < 200
+
+
 def test_nobody_answers(tmp_path: Path) -> None:
     whole = RemoteFile(("http://127.0.0.1:9/some.hdf5",), 1, "")
     with pytest.raises(UserError, match=r"http://127.0.0.1:9/some.hdf5 failed 5 times, at last with: "):

@@ -78,7 +78,7 @@ BAD = {
     "no dimensions": (change("actions", lambda x: x[:, :0]), "which is empty"),
     "nan": (at("observations", (5, 2), np.nan), "'observations' has NaN or infinite values, first at row 5 (1 rows in"),
     "infinite": (at("rewards", slice(3, 5), np.inf), "'rewards' has NaN or infinite values, first at row 3 (2 rows in"),
-    "huge": (put("rewards", np.full(12, 1e300)), "'rewards' has NaN or infinite"),
+    "huge": (put("rewards", np.full(12, 1e300)), "'rewards' reaches 1e+300 at row 0 (12 rows"),
     "flag": (change("terminated", lambda x: x + 2), "'terminated' is 2 at row 0 (12 rows in all): flags must be 0"),
     "nan flag": (put("truncated", np.full(12, np.nan)), "'truncated' is nan at row 0"),
     "text": (put("rewards", np.array(["a"] * 12)), "'rewards' holds <U1 values: store plain numbers"),

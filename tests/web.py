@@ -1,6 +1,7 @@
 """A web server on this machine that misbehaves as it is told."""
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,6 +18,8 @@ class Server:
         statuses: answers to the first requests, before any content.
         ranges: whether it knows them.
         declares: whether it says how much it sends.
+        redirect: where every request is sent on to.
+        pause: seconds after each byte.
         asked: each request's Range header.
     """
 
@@ -25,6 +28,8 @@ class Server:
     statuses: list[int] = field(default_factory=list)
     ranges: bool = True
     declares: bool = True
+    redirect: str | None = None
+    pause: float = 0.0
     asked: list[str | None] = field(default_factory=list)
     url: str = ""
 
@@ -37,6 +42,11 @@ def _handler(server: Server) -> type[BaseHTTPRequestHandler]:
             if server.statuses:
                 self.send_error(server.statuses.pop(0))
                 return
+            if server.redirect is not None:
+                self.send_response(302)
+                self.send_header("Location", server.redirect)
+                self.end_headers()
+                return
             begin = int(asked.removeprefix("bytes=").removesuffix("-")) if asked and server.ranges else 0
             if begin >= len(server.content):
                 self.send_error(416)
@@ -48,6 +58,9 @@ def _handler(server: Server) -> type[BaseHTTPRequestHandler]:
             if server.declares:
                 self.send_header("Content-Length", str(len(body)))
             self.end_headers()
+            for byte in body if server.pause else b"":
+                self.wfile.write(bytes([byte]))
+                time.sleep(server.pause)
             self.wfile.write(body[: server.drop.pop(0)] if server.drop else body)
 
         def log_message(self, format: str, *args: object) -> None:

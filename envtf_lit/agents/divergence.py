@@ -1,4 +1,4 @@
-"""The guard of a training: values that no policy can have, and what is not finite, stop it with a cause and cures."""
+"""What no policy's values can be, and stops its training: larger than rewards allow."""
 
 import math
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from envtf_lit.errors import UserError
+from envtf_lit.divergence import OVERFLOW, diverged
 
 SLACK, ROUGH = 2.0, 1.0  # factor, and values of a network that has learned nothing yet, by which the bound is wide
 VALUES = ("q_data", "q_target", "q_policy")  # logged means that are values, in units of the return scale
@@ -31,12 +31,9 @@ def check_means(means: Mapping[str, Tensor], largest: float, label: str, epoch: 
     bound = SLACK * largest + ROUGH
     for name, value in zip(means, torch.stack([mean.float() for mean in means.values()]).tolist(), strict=True):
         if not math.isfinite(value):
-            cause = "so a value, a loss or a gradient has overflowed"
+            cause = OVERFLOW
         elif name in VALUES and value > bound:
             cause = f"where rewards allow {largest:.3g} (max |reward| / (1 - discount)), so values feed on themselves"
         else:
             continue
-        raise UserError(
-            f"{label} diverged in epoch {epoch}: {name} is {value:.3g}, {cause}; {cures.get(name, cures[''])}. The "
-            "epoch before is kept in the run's last checkpoint."
-        )
+        raise diverged(label, f"in epoch {epoch}", name, value, cause, cures, epoch=epoch)

@@ -27,7 +27,7 @@ from envtf_lit.data.options import DownloadOptions
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.options.schema import build
 from envtf_lit.pipeline.params import Params
-from envtf_lit.training import Curves, WholeCheckpoints
+from envtf_lit.training import Curves, Guard, WholeCheckpoints
 from envtf_lit.world_models.options import KINDS, TransformerOptions
 
 TRUST = (
@@ -89,9 +89,9 @@ class _LinkedCLI(LightningCLI):
 
     def instantiate_trainer(self, **kwargs: Any) -> L.Trainer:
         trainer = super().instantiate_trainer(**kwargs)
-        # only now: Lightning would take it for the callback that saves checkpoints, and make none;
+        # only now: Lightning would take them for callbacks that save checkpoints, and make none;
         # at the front, so that checkpoints hold the row of their epoch
-        trainer.callbacks.insert(0, Curves())  # pyright: ignore[reportAttributeAccessIssue]
+        trainer.callbacks[:0] = [Guard(), Curves()]  # pyright: ignore[reportAttributeAccessIssue]
         if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:  # neither a strategy's own nor the user's
             trainer.strategy.checkpoint_io = WholeCheckpoints()
         return trainer

@@ -11,7 +11,7 @@ import torch
 
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.errors import UserError
-from envtf_lit.files import read_json
+from envtf_lit.files import check_plain, read_json
 from envtf_lit.options.schema import build
 from envtf_lit.pipeline.params import Params
 from envtf_lit.world_models.options import KINDS
@@ -91,6 +91,7 @@ def checkpoint_class(path: str | Path, classes: Mapping[str, type]) -> str | Non
 
 
 def _hyper_parameters(path: str | Path) -> dict[str, Any]:
+    check_plain(path)
     return torch.load(path, map_location="cpu", weights_only=True, mmap=True)["hyper_parameters"]  # no weights read
 
 

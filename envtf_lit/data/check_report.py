@@ -15,6 +15,7 @@ from envtf_lit.data.checks import examine
 from envtf_lit.data.columns import blocks, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.findings import Finding
+from envtf_lit.data.outliers import wild_values
 from envtf_lit.data.sources.local import open_source
 from envtf_lit.data.statistics import CONSTANT
 from envtf_lit.errors import UserError
@@ -113,6 +114,7 @@ def quality(dataset: OfflineDataset) -> list[Finding]:
         *_endings(dataset),
         *_seams(dataset),
         *_ranges(dataset),
+        *wild_values(dataset),
         *_duplicates(dataset),
     ]
 

@@ -17,12 +17,7 @@ from envtf_lit.data.statistics import Moments
 from envtf_lit.errors import UserError
 from envtf_lit.robots.tasks import Task, find_task, get_task
 
-CONTRADICTIONS = (
-    0.2  # share of falls that log and robot's rule may see differently: some logs are rounded, or end early
-)
-CONTRADICTIONS = (
-    0.2  # share of falls that log and robot's rule may see differently: some logs are rounded, or end early
-)
+CONTRADICTIONS = 0.2  # share of falls that log and rule may see differently: some logs are rounded, or end early
 FEWEST_FALLS = 20  # that they must see differently
 RANKS = {
     "observations": 2,
@@ -36,6 +31,7 @@ RANKS = {
 NUMBERS = ("observations", "actions", "rewards", "next_observations")
 FLAGS = {"terminated": "terminals", "truncated": "timeouts"}  # and what D4RL calls them
 NEEDED = ("observations", "actions", "rewards")
+LARGEST = 1e19  # a magnitude whose square is a float32
 ROUNDING = 1e-12  # of a magnitude: what varies less in float64 is rounding itself
 
 
@@ -209,14 +205,16 @@ def _one_line(error: Exception) -> str:
 
 
 def _sound(part: np.ndarray, dtype: type) -> np.ndarray:
-    """(n,) whether each row can be stored as that type: finite in float32, 0 or 1, a whole number."""
+    """(n,) whether each row can be stored as that type: of squares finite in float32, 0 or 1, a whole number."""
     if dtype is bool:
         return np.isin(part, (0, 1))
     if dtype is np.int64:
         exact = part.astype(np.float64)
         return np.less(np.abs(exact), 2**53) & np.equal(exact, np.round(exact))
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite
-        return np.atleast_1d(np.isfinite(part.astype(np.float32, copy=False)).reshape(len(part), -1).all(axis=1))
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite; NaN is no less than anything
+        return np.atleast_1d(
+            (np.abs(part.astype(np.float32, copy=False)) <= LARGEST).reshape(len(part), -1).all(axis=1)
+        )
 
 
 def _unsound(name: str, bad: int, first: int, value: np.ndarray) -> Finding:
@@ -224,6 +222,11 @@ def _unsound(name: str, bad: int, first: int, value: np.ndarray) -> Finding:
         return Finding("error", f"{name!r} is {value[0]} at row {first} ({bad} rows in all)", "flags must be 0 or 1")
     if name == "episode_index":
         return Finding("error", f"{name!r} is {value[0]} at row {first}", "number the episodes with whole numbers")
+    if np.isfinite(value).all():
+        what = f"{name!r} reaches {value.flat[np.abs(value).argmax()]:.3g} at row {first} ({bad} rows in all)"
+        return Finding(
+            "error", f"{what}, whose square float32 cannot hold", "remove those episodes, or change the unit"
+        )
     what = f"{name!r} has NaN or infinite values, first at row {first} ({bad} rows in all)"
     return Finding("error", what, "remove those episodes")
 

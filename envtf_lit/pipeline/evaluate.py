@@ -14,7 +14,7 @@ from envtf_lit.evaluation.metrics import collect_metrics, collect_offline_metric
 from envtf_lit.evaluation.offline import evaluate_offline
 from envtf_lit.figures import gallery
 from envtf_lit.figures.video import no_video, real_vs_imagined
-from envtf_lit.files import replacing, write_json
+from envtf_lit.files import check_plain, replacing, write_json
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.dataset import dataset_of
 from envtf_lit.pipeline.params import Params, algorithm_of
@@ -57,7 +57,8 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         _, held_out = held_out.validation_and_test()
         scale = Scale.of(training)
         report = horizon_report(model, whole_episodes(held_out, options.trajectories, seed=params.seed), scale)
-        policies = {policy: load_policy(root / POLICIES / policy) for policy in params.train_policy}
+        folders = {policy: root / POLICIES / policy for policy in params.train_policy}
+        policies = {policy: load_policy(place, guarded=robot is not None) for policy, place in folders.items()}
         curves = {policy: _curves(root / POLICIES / policy) for policy in policies}
         facts: dict[str, Any] = dict(
             seed=params.seed,
@@ -98,6 +99,9 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
     return metrics
 
 
+MOST_CURVES = 16 << 20  # bytes
+
+
 def _labels(params: Params) -> dict[str, str]:
     """What figures and tables call each policy: its algorithm, with its own name where several have the same."""
     labels = {name: ALGORITHMS[algorithm_of(options)].label for name, options in params.train_policy.items()}
@@ -106,8 +110,12 @@ def _labels(params: Params) -> dict[str, str]:
 
 
 def _curves(folder: Path) -> pd.DataFrame:
+    path = folder / CURVES
     try:
-        return pd.read_csv(folder / CURVES)
+        check_plain(path, MOST_CURVES)
+        return pd.read_csv(path)
+    except (UnicodeDecodeError, pd.errors.ParserError) as error:
+        raise UserError(f"{path} is damaged ({' '.join(str(error).split())}): run the stage that writes it.") from None
     except (FileNotFoundError, pd.errors.EmptyDataError):
         raise UserError(
             f"{folder} has no {CURVES}, which the plots are drawn from: run the stage that writes the folder, or copy "

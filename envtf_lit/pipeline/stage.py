@@ -64,7 +64,9 @@ def run_stage(name: str, params: Params, root: Path) -> Iterator[None]:
 
 def note_timing(root: Path, name: str, value: Any) -> None:
     """Notes seconds or rates in `.envtf/timings.json`, a side file that no hash covers."""
-    path = root / ".envtf" / "timings.json"
+    path, timings = root / ".envtf" / "timings.json", {}
     with contextlib.suppress(ValueError):  # a damaged side file is begun anew
-        timings = read_json(path) if path.exists() else {}
+        found = read_json(path) if path.exists() else {}
+        timings = found if isinstance(found, dict) else {}
+    with contextlib.suppress(ValueError):  # the work is done, whether this can be noted or not
         write_json(path, timings | {name: value})

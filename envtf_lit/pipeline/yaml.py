@@ -13,9 +13,11 @@ from typing import Any, Literal, get_origin, get_type_hints
 from docstring_parser import parse as parse_docstring
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.errors import UserError, did_you_mean
+from envtf_lit.files import check_plain
 from envtf_lit.options.schema import kind, options_class
 from envtf_lit.pipeline.params import COMMON, Params, algorithm_of, build_params, kind_of
 from envtf_lit.pipeline.renamed_options import refuse_former
@@ -23,6 +25,8 @@ from envtf_lit.world_models.options import KINDS
 
 PRESETS = ("tiny", "small", "base", "paper")
 WIDTH = 120
+MOST_TEXT = 64 << 10  # bytes of params.yaml, of which the longest preset has a tenth; more takes seconds to read
+MOST_VALUES, MOST_BRACKETS = 10_000, 1_000
 NAMED = {"train_model": "kind", "train_policy": "algorithm"}  # stages with named sections, and the tag of each
 
 
@@ -36,9 +40,12 @@ def load_params(path: str | Path = "params.yaml", overrides: Sequence[str] = ())
     """
     path = Path(path)
     try:
+        check_plain(path, MOST_TEXT)
         text = path.read_text()
     except FileNotFoundError:
         raise UserError(f"{path} does not exist: run `envtf init .` to write one, or give --params.") from None
+    except UserError:
+        raise
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"Cannot read {path} ({error}): give a YAML file.") from None
     try:
@@ -149,10 +156,32 @@ def meanings(cls: type) -> dict[str, str]:
 
 
 def _parse(text: str, where: str) -> Any:
+    if text.count("[") + text.count("{") > MOST_BRACKETS:  # each level of which is looked at again for every one below
+        raise UserError(f"{where} has more than {MOST_BRACKETS:,} opening brackets: write what an option asks for.")
     try:
+        if "*" in text:
+            _check_aliases(text, where)
         return YAML(typ="safe", pure=True).load(text)
+    except RecursionError:
+        raise UserError(f"{where} is not valid YAML: brackets in brackets, far too deep.") from None
     except YAMLError as error:
         raise UserError(f"{where} is not valid YAML: {' '.join(str(error).split())}") from None
+
+
+def _check_aliases(text: str, where: str) -> None:
+    """Refuses aliases of aliases that stand for far more than they are: ten lines make a thousand million values."""
+    sizes, opened, size = dict[str, int](), list[tuple[str | None, int]](), 0
+    for event in YAML(typ="safe", pure=True).parse(text):
+        name = getattr(event, "anchor", None)
+        size += sizes.get(name, 1) if isinstance(event, AliasEvent) else 1
+        if isinstance(event, CollectionStartEvent):
+            opened.append((name, size))
+        elif isinstance(event, CollectionEndEvent):
+            name, begin = opened.pop()
+            if name is not None:
+                sizes[name] = size - begin
+        if size > MOST_VALUES:
+            raise UserError(f"{where} stands for more than {MOST_VALUES:,} values, by its aliases: write them out.")
 
 
 def _override(text: str) -> dict[str, Any]:

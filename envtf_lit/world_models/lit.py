@@ -13,6 +13,7 @@ from torch import Tensor
 from envtf_lit import training
 from envtf_lit.data.datamodules import WindowData
 from envtf_lit.data.loaders import epoch_generator
+from envtf_lit.divergence import diverged
 from envtf_lit.errors import UserError
 from envtf_lit.options.schema import build
 from envtf_lit.world_models.ensemble import EnsembleDynamics
@@ -25,6 +26,7 @@ from envtf_lit.world_models.transformer import EnvironmentTransformer
 SELECTION_SEGMENTS, SELECTION_HORIZON = 256, 20  # open-loop stretches by which models are selected
 EPISTEMIC_TOKENS = 100_000  # training rows that epistemic variance is fitted to, at most
 CALIBRATION_EPISODES = 50  # held-out episodes that the predicted variances are scaled by, at most
+SINGULAR = "since hidden tokens are too large for its inverse"
 IMPROVEMENT = 0.01  # of a member's held-out error, below which it counts as none
 
 
@@ -62,6 +64,7 @@ class LitWorldModel(L.LightningModule):
     """LightningModule that trains an Environment Transformer on windows of a log.
 
     Attributes:
+        label: its name in messages.
         monitor: logged name by which the best weights are selected, or None where the module selects them itself.
 
     Args:
@@ -75,6 +78,7 @@ class LitWorldModel(L.LightningModule):
     """
 
     Options: ClassVar[type[WorldModelOptions]] = TransformerOptions
+    label: ClassVar[str] = "The transformer"
     monitor: str | None = "val/open_loop_error"
 
     def __init__(
@@ -138,8 +142,14 @@ class LitWorldModel(L.LightningModule):
         """Fits the epistemic variance to training windows, then both variances' scale to the episodes for validation.
 
         Once, at the end, with `data` set up.
+
+        Raises:
+            UserError: the hidden tokens are so large that there is no posterior.
         """
-        self._fit_epistemic(data)
+        try:
+            self._fit_epistemic(data)
+        except torch.linalg.LinAlgError:
+            raise diverged(self.label, "in its training", "the posterior's precision", math.nan, SINGULAR) from None
         if len(data.held_out.episode_starts) > 1:  # or the one that is tested on would be fitted to
             model = cast(EnvironmentTransformer, self.model)  # the ensemble's module has its own way
             model.recalibrate(whole_episodes(data.validation, CALIBRATION_EPISODES, seed=self.seed))
@@ -228,6 +238,7 @@ class LitEnsemble(LitWorldModel):
 
     model: EnsembleDynamics  # pyright: ignore[reportIncompatibleVariableOverride]
     Options = EnsembleOptions
+    label = "The ensemble"
     monitor = None
     best_error: Tensor
     stale: Tensor

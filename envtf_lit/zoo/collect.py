@@ -16,6 +16,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.policy import Policy, RandomPolicy
 from envtf_lit.progress import progress_bar
 from envtf_lit.robots.tasks import Robot, Task
+from envtf_lit.workers import end_with_parent
 from envtf_lit.zoo.record import Columns, empty_columns, record
 from envtf_lit.zoo.snapshots import MIN_ROWS, Phase, Series, load_snapshot, plan, read_series
 
@@ -81,7 +82,7 @@ def _run(robot: Robot, series: Series, units: list[Phase], seed: int, workers: i
         yield from ((index, _collect_unit(robot, series, unit, seed, index)) for index, unit in jobs)
         return
     context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context) as pool:
+    with ProcessPoolExecutor(min(workers, len(jobs)), context, end_with_parent) as pool:
         try:
             futures = {pool.submit(_collect_unit, robot, series, unit, seed, index): index for index, unit in jobs}
             for future in as_completed(futures):

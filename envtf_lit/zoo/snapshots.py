@@ -89,7 +89,9 @@ def read_series(robot: Robot, zoo: Path | None = None) -> Series:
     try:
         snapshots = tuple(Snapshot(**snapshot) for snapshot in content["snapshots"])
         known = {name: content[name] for name in ("warm_up_steps", "trained_with", "architecture")}
-    except (KeyError, TypeError) as error:
+        if not snapshots:
+            raise KeyError("no snapshots")
+    except (KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{folder}/zoo.json is not what `envtf zoo train` writes ({error}): train anew.") from None
     return Series(ROBOTS[robot.name], folder, snapshots=snapshots, **known)
 

@@ -5,13 +5,14 @@ import hashlib
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import requests
+import urllib3
 from rich.progress import DownloadColumn, TransferSpeedColumn
 
 from envtf_lit.errors import DISK_FULL, UserError
@@ -20,6 +21,7 @@ from envtf_lit.progress import progress_bar
 ATTEMPTS = 5  # connections in a row that bring nothing new, before a server is given up
 TIMEOUT = (10, 60)  # seconds: to connect, between two pieces
 PIECE = 1 << 16  # bytes, of which a broken connection loses the last
+SLOWEST, WINDOW = 1_000, 60.0  # bytes a second that a server must send, over so many seconds
 PASSING = (408, 425, 429, 500, 502, 503, 504)  # statuses worth another try
 
 
@@ -155,17 +157,60 @@ def _connect(url: str, size: int, partial: Path, show: Callable[[int], None]) ->
         partial.unlink()
         have = 0
     headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
-    with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as response:
+    with _asked(url, headers) as response:
         have = _check_status(response, partial, have)
         _check_size(response, have, size)
         with partial.open("ab" if have else "wb") as stream:
-            for piece in response.iter_content(PIECE):
+            for piece in _pieces(response):
                 stream.write(piece)
                 show(stream.tell())
                 if stream.tell() > size:
                     raise _GivenUp(f"sends more than the {size:,} bytes that are known")
     if _have(partial) < size:  # only a server that does not say how much it sends gets here
         raise requests.ConnectionError("the connection ended early")
+
+
+def _asked(url: str, headers: dict[str, str]) -> requests.Response:
+    """The answer, after redirects.
+
+    Raises:
+        requests.RequestException: there is none.
+        _GivenUp: a redirect leads to no address.
+    """
+    try:
+        return requests.get(url, headers=headers, stream=True, timeout=TIMEOUT)
+    except requests.RequestException as error:
+        if isinstance(error, ValueError):  # what an address can be wrong in
+            raise _GivenUp(f"leads to what is no address ({_reason(error)})") from None
+        raise
+    except (ValueError, urllib3.exceptions.HTTPError) as error:  # of the address, which requests lets through
+        raise _GivenUp(f"leads to what is no address ({' '.join(str(error).split())[:200]})") from None
+
+
+def _pieces(response: requests.Response) -> Iterator[bytes]:
+    """What comes, as soon as it comes.
+
+    Raises:
+        requests.RequestException: the connection broke.
+        _GivenUp: it brings so little that the file would take days.
+    """
+    begin, received = time.monotonic(), 0
+    while True:
+        try:
+            piece = response.raw.read1(PIECE)
+        except urllib3.exceptions.ProtocolError as error:
+            raise requests.exceptions.ChunkedEncodingError(error) from error
+        except (urllib3.exceptions.HTTPError, OSError) as error:
+            raise requests.ConnectionError(error) from error
+        if not piece:
+            return
+        yield piece
+        received += len(piece)
+        passed = time.monotonic() - begin
+        if passed > WINDOW:
+            if received < SLOWEST * passed:
+                raise _GivenUp(f"sends {received / passed:.3g} bytes a second, and less than {SLOWEST:,} is no use")
+            begin, received = time.monotonic(), 0
 
 
 def _check_status(response: requests.Response, partial: Path, have: int) -> int:
