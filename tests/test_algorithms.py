@@ -121,7 +121,7 @@ def test_all_are_evaluated_and_reported_side_by_side(
     project: tuple[Params, Path], repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("papermill")
-    from tests.reports import said
+    from tests.made_up_runs import said
 
     params, root = project
     for name in ALGORITHMS:

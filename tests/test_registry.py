@@ -115,7 +115,7 @@ def test_a_toy_is_evaluated(experiment: Path) -> None:
 
 def test_a_toy_is_reported(experiment: Path, repository: Path) -> None:
     pytest.importorskip("papermill")
-    from tests.reports import said  # needs the extra `pipeline`, too
+    from tests.made_up_runs import said  # needs the extra `pipeline`, too
 
     shutil.copytree(repository / "notebooks", experiment / "notebooks")
     report(tiny(), experiment, progress=False)

@@ -28,6 +28,7 @@ TRACE = 0.95  # lambda of the state value's TD(lambda) targets
 TARGET_RATE = 0.3  # share of the state value that enters its target at each update of the actor
 OLDEST = 1_000  # steps after which a rollout begins anew at a real state
 BETAS = (0.7, 0.95)  # of the actor's Adam, as in SHAC
+LOST = 0.1  # what an e-fold of novelty beyond the limit costs a path that ends there, in deviations of the returns
 CLIP = 1.0  # largest norm of the actor's gradient
 
 
@@ -64,14 +65,6 @@ class Paths(Rollouts):
     excess: Tensor
 
 
-@dataclass(frozen=True)
-class Returns:
-    """Mean and standard deviation of the returns of the log's rows, in units of the paths' rewards."""
-
-    mean: float | Tensor
-    spread: float | Tensor
-
-
 class StateValues(nn.Module):
     """`V(s)` and its slow target, which stand for what follows an imagined path.
 
@@ -84,7 +77,7 @@ class StateValues(nn.Module):
         self.value = StateValue(observation_dim, hidden=HIDDEN)
         self.target_value = copy.deepcopy(self.value).requires_grad_(False)
 
-    def imagined_return(self, paths: Paths, discount: float, log: Returns) -> Tensor:
+    def imagined_return(self, paths: Paths, discount: float, spread: float | Tensor) -> Tensor:
         """(B,) `sum_k discount^k r_k + discount^H V(s_H)`, up to the fall (Xu et al. 2022, equation 5).
 
         Where the model has left what it knows, at a step k, its prediction counts for nothing: the path ends in s_k,
@@ -98,14 +91,14 @@ class StateValues(nn.Module):
         last = torch.where(cut, stands.sum(0) - 1, len(taken))  # (B,) the state that each path ends in
         end = self.value(states[last, torch.arange(len(last), device=last.device)])
         excess = torch.where(stands[:-1] & paths.halted, paths.excess, 0.0).sum(0)
-        end = torch.where(cut, worth(end, excess, log), end)
+        end = torch.where(cut, worth(end, excess, spread), end)
         return total + torch.where(cut | stands[-1], discount**last * end, 0.0)
 
     @torch.no_grad()
-    def value_targets(self, paths: Paths, discount: float, log: Returns) -> Tensor:
+    def value_targets(self, paths: Paths, discount: float, spread: float | Tensor) -> Tensor:
         """(H, B) TD(lambda) targets under the slow state value (Xu et al. 2022, equations 6, 7), to a fall or a cut."""
         later = self.target_value(paths.next_observations)
-        cut = worth(self.target_value(paths.observations), paths.excess, log)
+        cut = worth(self.target_value(paths.observations), paths.excess, spread)
         target, targets = later[-1], torch.empty_like(paths.rewards)
         for t in reversed(range(len(targets))):
             target = (1.0 - TRACE) * later[t] + TRACE * target
@@ -114,12 +107,12 @@ class StateValues(nn.Module):
         return targets
 
     def value_batches(
-        self, paths: Paths, discount: float, log: Returns, generator: torch.Generator
+        self, paths: Paths, discount: float, spread: float | Tensor, generator: torch.Generator
     ) -> Iterator[tuple[Tensor, Tensor]]:
         """Batches of visited states and their targets, several times in random order."""
         visited = standing(paths)[0][:-1].flatten()
         states = paths.observations.detach().flatten(0, 1)[visited]
-        targets = self.value_targets(paths, discount, log).flatten()[visited]
+        targets = self.value_targets(paths, discount, spread).flatten()[visited]
         for _ in range(PASSES):
             order = torch.randperm(len(states), generator=generator, device=states.device)
             for rows in order.split(BATCH):
@@ -142,14 +135,15 @@ def standing(paths: Paths) -> tuple[Tensor, Tensor]:
     return stands, stands[:-1] & ~paths.halted
 
 
-def worth(value: Tensor, excess: Tensor, log: Returns) -> Tensor:
-    """What a path is worth that the model can't follow further: `min(V(s), mean(G)) - std(G) log(novelty / limit)`.
+def worth(value: Tensor, excess: Tensor, spread: float | Tensor) -> Tensor:
+    """What a path is worth that the model can't follow further: `V(s) - LOST std(G) log(novelty / limit)`.
 
-    Riches beyond what the log's rows earned need evidence, and here there is none; a state that is worse than those
-    stays so. Above their mean no action is taken for the sake of what lies behind. A bare end would have no gradient in
-    the action that led astray, and the steps before would go on to push it; so it costs the more the further it led.
+    `V(s)` of the last state that it knew, since what lies behind may hold riches or ruin, and here is no evidence of
+    either. A bare end would have no gradient in the action that led astray; so it costs a little more the further it
+    led. At ten times the cost that gradient rules all others, and the policy stays where it began: on
+    hopper-medium-replay (seed 0) `et_cql` then scored 45 and 60, at this cost 84, with a bare end 84, unguarded 91.
     """
-    return value.clamp(max=log.mean) - log.spread * excess
+    return value - LOST * spread * excess
 
 
 class ImaginedPaths:
@@ -169,9 +163,8 @@ class ImaginedPaths:
         """The next `horizon` steps under the actor's sampled actions, differentiable in the actor.
 
         Each rollout runs, from its real state to its end, in a world model of its own, drawn from the posterior as the
-        rollouts' options say. They also say
-        what uncertainty costs, and where a path has left what the model knows. No rollout leaves where its robot falls,
-        or where it is lost: what comes after means nothing.
+        rollouts' options say. They also say what uncertainty costs, and where a path has left what the model knows. No
+        rollout leaves where its robot falls, or where it is lost: what comes after means nothing.
 
         Args:
             actor: acts.
@@ -258,16 +251,16 @@ class ValueGradient(Phase):
     def value_gradient_step(self, agent: Agent, batch: Batch, done: int) -> Logs:
         """One step of the actor along the gradient, and several of the state value."""
         values, discount = self.values, agent.options.discount
-        log = Returns(agent.typical_return / agent.return_scale, agent.return_spread / agent.return_scale)
+        spread = agent.return_spread / agent.return_scale
         assert isinstance(agent.actor, TanhGaussianActor)
         paths = self.paths.next(agent.actor, agent.return_scale, agent.generator)
         with held_fixed(values.value):
-            imagined = values.imagined_return(paths, discount, log).mean()
+            imagined = values.imagined_return(paths, discount, spread).mean()
             clone_loss = agent.clone_loss(batch)
             loss = self.options.clone_weight * clone_loss - imagined
             agent.descend("actor_by_gradient", loss, rate=self.rate(done / self.updates), clip=CLIP)
         value_loss = torch.zeros(())
-        for observations, targets in values.value_batches(paths, discount, log, agent.generator):
+        for observations, targets in values.value_batches(paths, discount, spread, agent.generator):
             value_loss = values.value_loss(observations, targets)
             agent.descend("value", value_loss)
         cut = (standing(paths)[0][:-1] & paths.halted).any(0).float().mean()

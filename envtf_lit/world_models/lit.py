@@ -148,7 +148,7 @@ class LitWorldModel(L.LightningModule):
         """
         try:
             self._fit_epistemic(data)
-        except torch.linalg.LinAlgError:
+        except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
             raise diverged(self.label, "in its training", "the posterior's precision", math.nan, SINGULAR) from None
         if len(data.held_out.episode_starts) > 1:  # or the one that is tested on would be fitted to
             model = cast(EnvironmentTransformer, self.model)  # the ensemble's module has its own way
