@@ -172,8 +172,8 @@ def _check_aliases(text: str, where: str) -> None:
     """Refuses aliases of aliases that stand for far more than they are: ten lines make a thousand million values."""
     sizes, opened, size = dict[str, int](), list[tuple[str | None, int]](), 0
     for event in YAML(typ="safe", pure=True).parse(text):
-        name = getattr(event, "anchor", None)
-        size += sizes.get(name, 1) if isinstance(event, AliasEvent) else 1
+        name: str | None = getattr(event, "anchor", None)
+        size += sizes.get(name or "", 1) if isinstance(event, AliasEvent) else 1
         if isinstance(event, CollectionStartEvent):
             opened.append((name, size))
         elif isinstance(event, CollectionEndEvent):
