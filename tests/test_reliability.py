@@ -42,9 +42,9 @@ STAGES = {  # what each writes, beside the logs of `.envtf`
     ("train_model",): "models/world_model/transformer",
     ("train_policy", "bc"): "models/policy/bc",
     ("generate_rollouts",): "data/rollouts/transformer.h5",
-    ("train_policy", "et_cql"): "models/policy/et_cql",
+    ("train_policy", "cql"): "models/policy/cql",
 }
-KILLS = {("download",): 15, ("train_model",): 20, ("train_policy", "bc"): 10, ("train_policy", "et_cql"): 15}  # 60
+KILLS = {("download",): 15, ("train_model",): 20, ("train_policy", "bc"): 10, ("train_policy", "cql"): 15}  # 60
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": "1"}
 
 
