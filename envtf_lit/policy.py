@@ -359,7 +359,8 @@ def load_policy(folder: str | Path, *, guarded: bool = True) -> Actor:
 
 
 def _refuse_unknown(actor: nn.Module, given: tuple[Tensor, ...]) -> None:
-    if torch.compiler.is_compiling() or torch.jit.is_tracing():  # pyright: ignore[reportPrivateImportUsage]  # graphs raise nothing
+    tracing = torch.jit.is_tracing()  # pyright: ignore[reportPrivateImportUsage]
+    if torch.compiler.is_compiling() or tracing:  # a graph raises nothing
         return
     observation = given[0]
     if observation.isfinite().all():

@@ -221,3 +221,17 @@ def test_brackets_in_a_path_are_printed(tmp_path: Path, capsys: pytest.CaptureFi
     assert str(folder / "[red]my.h5") in capsys.readouterr().out
     assert exit_status(["data", "convert", str(folder / "[red]my.h5"), "x.npz"]) == 2
     assert f"envtf: {folder / '[red]my.h5'} is not a file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["data", "check"], ["data", "convert"], ["download", "--params"], ["init"]])
+@pytest.mark.parametrize("place", ["long", "circle"])
+def test_a_path_that_can_be_no_file_ends_in_a_sentence(
+    command: list[str], place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / ("x" * 300 + ".h5" if place == "long" else "circle.h5")
+    if place == "circle":
+        path.symlink_to(path)
+    rest = [str(tmp_path / "out.h5")] if command[-1] == "convert" else []
+    assert exit_status([*command, str(path), *rest]) != 0
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err and (said.err + said.out).strip()

@@ -220,3 +220,18 @@ def test_flags_of_earlier_versions_are_taken_as_they_are_called_now() -> None:
     assert of_today(["fit", "--model.options.critics", "2", "--model.seed=1"]) == ["fit", "--model.seed=1"]
     with pytest.raises(UserError, match=r"updates_per_step is 7, and always 10 by now"):
         of_today(["--model.options.updates_per_step", "7"])
+
+
+@pytest.mark.parametrize(
+    ("flag", "sentence"),
+    [
+        ("--trainer.precision=bf16-true", "give 32-true, or bf16-mixed"),
+        ("--trainer.precision=16-true", "give 32-true, or bf16-mixed"),
+        ("--ckpt_path=best", "give the path of a checkpoint, or last"),
+    ],
+)
+def test_what_lightning_takes_and_no_model_here_can_is_refused(
+    flag: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    enter_project(tmp_path, monkeypatch)
+    assert sentence in refused(capsys, "model", "fit", NO_LOGGER, flag, **SIZES["model"], **RUN["model"])

@@ -121,6 +121,16 @@ class _LinkedCLI(LightningCLI):
                 f"model.{self.tag} is {config.model[self.tag]!r} in a place that comes too late: give the flag "
                 f"--model.{self.tag}, whole."
             )
+        if str(trainer.precision).endswith("-true") and "32" not in str(trainer.precision):
+            raise UserError(
+                f"trainer.precision is {trainer.precision}, and scales, sums and predictions need more than that many "
+                "digits: give 32-true, or bf16-mixed for products of matrices alone."
+            )
+        if config.ckpt_path == "best":
+            raise UserError(
+                "--ckpt_path is best, which names a checkpoint of this very run, and it has none yet: give the path of "
+                "a checkpoint, or last."
+            )
         plain = build(self.options, options.as_dict(), SECTION)
         build(Params, {"seed": config.model.seed}, "model")
         self.check(plain, config.data.held_out)

@@ -1,6 +1,7 @@
 """The command line, `envtf`: finds the command that is meant, and says in a sentence what stopped it."""
 
 import contextlib
+import errno
 import os
 import shutil
 import signal
@@ -15,6 +16,8 @@ from types import FrameType
 from envtf_lit.cli.commands import ANEW, COMMANDS, GROUPS
 from envtf_lit.errors import DISK_FULL, UserError, did_you_mean
 
+# what a path is to blame for: too long a name, links in a circle, a file where a folder should be, no permission
+PLACE = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM, errno.EROFS)
 HELP = ("-h", "--help")
 ABOUT = "From a log of trajectories to a world model, a policy, and the evidence for both"
 
@@ -38,9 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except UserError as error:
         _fail(str(error), 2)
     except OSError as error:
-        if error.errno not in DISK_FULL:
+        if error.errno in DISK_FULL:
+            _fail(f"No space left on the disk ({error}): free some and run the same command again.", 2)
+        if error.errno not in PLACE or error.filename is None:
             raise
-        _fail(f"No space left on the disk ({error}): free some and run the same command again.", 2)
+        _fail(f"Cannot use {error.filename!s:.200}: {error.strerror}; choose another place or name.", 2)
     except KeyboardInterrupt:
         _fail(f"Interrupted. {_rerun(words)}", 128 + signal.SIGINT)
     except Stopped as stop:
