@@ -2,13 +2,13 @@
 
 Both sides learn from one log of noise, with three hidden layers of 256 units, 256 rows a batch and, of CQL, ten sampled
 actions of each kind; each by its own training loop, all of them in turn. What is measured is the loop from its first
-update to its last, drawing of rows included.
+update to its last, drawing of rows included: with one thread in seconds of its process, which other work on the machine
+does not stretch, with more in those of the clock on the wall.
 """
 
 import json
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,7 +33,7 @@ from envtf_lit.options.schema import Precision
 from envtf_lit.pipeline.train_policy import transition_data
 from envtf_lit.results import claim
 from envtf_lit.studies import d3rlpy_worker
-from envtf_lit.studies.machine import facts, in_turns, ratio, seconds, typical
+from envtf_lit.studies.machine import facts, in_turns, ratio, typical
 
 CPU = torch.device("cpu")
 ROWS, LENGTH, S, A = 10_000, 500, 11, 3  # of the log: its dimensions are Hopper's
@@ -187,10 +187,17 @@ class _Clock(Callback):
     seconds: float
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self.begin = time.perf_counter()
+        self.begin = d3rlpy_worker.now(torch.get_num_threads())
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self.seconds = time.perf_counter() - self.begin
+        self.seconds = d3rlpy_worker.now(torch.get_num_threads()) - self.begin
+
+
+def _timed(action: Callable[[], None]) -> float:
+    threads = torch.get_num_threads()
+    begin = d3rlpy_worker.now(threads)
+    action()
+    return d3rlpy_worker.now(threads) - begin
 
 
 def _ours(log: Path, name: str, updates: int, precision: Precision) -> Callable[[], float]:
@@ -215,7 +222,7 @@ def _bare(log: Path, name: str, updates: int, precision: Precision) -> Callable[
                 for index, batch in enumerate(batches):
                     agent.training_step(batch, index)
 
-        return seconds(loop, CPU)
+        return _timed(loop)
 
     return run
 
@@ -237,7 +244,7 @@ def _stacks(hidden: tuple[int, ...], batch: int) -> dict[str, Callable[[], float
                     optimizer.step()
                     follow(target, one, 0.005)
 
-        return lambda: seconds(run, CPU)
+        return lambda: _timed(run)
 
     return {"stacked": side(1, SEEDS), "one_after_another": side(SEEDS, 1)}
 
