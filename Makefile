@@ -1,6 +1,7 @@
 # Two commands are all the set-up there is: `make repro` and `make test`.
 #
 #   make repro PRESET=tiny      the whole pipeline in a temporary copy, in minutes
+#   make bench D3RLPY=PYTHON     speed of agents and model; a Python that has d3rlpy gives the ratios with it
 #   make … TORCH_INDEX=URL      another build of torch, such as https://download.pytorch.org/whl/cpu
 #   make … CONSTRAINTS=FILE     other pinned versions (CONSTRAINTS= for the newest that pyproject.toml allows)
 #   make … PYTHON=python3.12    another Python for a new .venv
@@ -25,10 +26,10 @@ PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check
 PINNED = $(PIP) $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) $(if $(LOCK),--no-build-isolation)
 TORCH = $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: help repro test test-all lint lock clean
+.PHONY: help repro test test-all bench lint lock clean
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -7
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -8
 
 repro: .venv/.installed .dvc/tmp/.ready
 ifeq ($(PRESET),)
@@ -46,6 +47,10 @@ test: .venv/.installed-dev
 
 test-all: .venv/.installed-dev
 	pytest -q -n auto -m "slow or not slow"
+
+bench: .venv/.installed-dev
+	envtf bench agents $(if $(D3RLPY),--d3rlpy $(D3RLPY)) --out reports/bench/agents.json
+	envtf bench model --out reports/bench/model.json
 
 lint: .venv/.installed-dev
 	ruff format --check .
