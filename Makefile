@@ -29,7 +29,7 @@ TORCH = $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 .PHONY: help repro test test-all bench lint lock clean
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -8
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -7
 
 repro: .venv/.installed .dvc/tmp/.ready
 ifeq ($(PRESET),)

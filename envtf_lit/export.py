@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from envtf_lit.actors import Actor, DeterministicActor, GaussianActor, TanhGaussianActor, kind_of
 from envtf_lit.errors import UserError, missing_extra
 from envtf_lit.files import replacing
-from envtf_lit.policy import Actor, DeterministicActor, GaussianActor, TanhGaussianActor, kind_of
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.step_graph import NEXT, StepGraph, step_graph

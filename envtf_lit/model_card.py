@@ -6,9 +6,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from envtf_lit.actors import Actor, kind_of
 from envtf_lit.errors import UserError
 from envtf_lit.files import read_json
-from envtf_lit.policy import Actor, kind_of
 from envtf_lit.sharing import Model, load_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 

@@ -17,9 +17,10 @@ from typing import Any
 import requests
 from torch import nn
 
+from envtf_lit.actors import POLICIES, Actor
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import read_json, replacing, write_text
-from envtf_lit.policy import POLICIES, Actor, load_policy
+from envtf_lit.policy import load_policy
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.store import WORLD_MODELS, load_world_model
 from envtf_lit.world_models.termination_head import TERMINATION, load_termination

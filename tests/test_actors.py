@@ -8,16 +8,9 @@ from typing import Any
 import pytest
 import torch
 
+from envtf_lit.actors import POLICIES, Actor, DeterministicActor, GaussianActor, TanhGaussianActor
 from envtf_lit.errors import UserError
-from envtf_lit.policy import (
-    POLICIES,
-    Actor,
-    DeterministicActor,
-    GaussianActor,
-    TanhGaussianActor,
-    load_policy,
-    save_policy,
-)
+from envtf_lit.policy import load_policy, save_policy
 
 S, A, B = 3, 2, 6
 LIMITS: dict[str, Any] = dict(action_low=[-2.0, 0.0], action_high=[2.0, 0.5])

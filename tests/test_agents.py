@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import nn
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.bc import BC
 from envtf_lit.agents.combo import COMBO
@@ -15,7 +16,6 @@ from envtf_lit.agents.et_cql import ETCQL, ETCQLPaper
 from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.sac import SAC
 from envtf_lit.errors import UserError
-from envtf_lit.policy import TanhGaussianActor
 from tests.hand_driven import B, S, hand_driven, imagining, make_batch
 
 A = 2  # actions, where no linear world is in play

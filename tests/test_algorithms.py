@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from envtf_lit.actors import kind_of
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.figures.style import COLOURS, policy_colours
@@ -24,7 +25,7 @@ from envtf_lit.pipeline.stage import METRICS
 from envtf_lit.pipeline.train_model import train_model
 from envtf_lit.pipeline.train_policy import train_policy
 from envtf_lit.pipeline.yaml import dump_params, preset_params
-from envtf_lit.policy import kind_of, load_policy
+from envtf_lit.policy import load_policy
 from envtf_lit.world_models.store import load_world_model
 from tests.test_training import Killed, bytes_of, kill_in_epoch
 from tests.walker import walker_dataset

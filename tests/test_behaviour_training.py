@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.cli.main import main
 from envtf_lit.errors import UserError
-from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.robots.tasks import ROBOTS, get_task
 from envtf_lit.zoo import train as behaviour_training
 from envtf_lit.zoo.collect import collect

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.cli.saved_options import checkpoint_options, model_architecture
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
@@ -22,7 +23,7 @@ from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.evaluate import _curves
 from envtf_lit.pipeline.stage import note_timing
 from envtf_lit.pipeline.yaml import load_params
-from envtf_lit.policy import TanhGaussianActor, load_policy, save_policy
+from envtf_lit.policy import load_policy, save_policy
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.training import _checkpoint, run_folder
 from envtf_lit.world_models.options import TransformerOptions

@@ -12,12 +12,13 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from safetensors.torch import save_file
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.model_folders import save_module
 from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.train_model import train_model
-from envtf_lit.policy import TanhGaussianActor, load_policy, save_policy
+from envtf_lit.policy import load_policy, save_policy
 from envtf_lit.training import trained
 from envtf_lit.world_models.fit import publish_world_model
 from envtf_lit.world_models.lit import LitWorldModel, lit_world_model, window_data

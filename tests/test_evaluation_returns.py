@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.errors import UserError
-from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.robots.returns import ROWS, evaluate_policy
 from envtf_lit.robots.tasks import ROBOTS
 

@@ -14,10 +14,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from envtf_lit.actors import POLICIES, Actor, GaussianActor, TanhGaussianActor
 from envtf_lit.cli.main import main
 from envtf_lit.errors import UserError
 from envtf_lit.export import export_policy, export_world_model
-from envtf_lit.policy import POLICIES, Actor, GaussianActor, RandomPolicy, TanhGaussianActor, save_policy
+from envtf_lit.policy import RandomPolicy, save_policy
 from envtf_lit.world_models.step_graph import NEXT, StepGraph, step_graph
 from envtf_lit.world_models.store import save_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer

@@ -14,9 +14,10 @@ from typing import Any
 import pytest
 import torch
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.errors import UserError
 from envtf_lit.files import recover, replacing, write_json, write_text
-from envtf_lit.policy import TanhGaussianActor, load_policy, save_policy
+from envtf_lit.policy import load_policy, save_policy
 
 
 @pytest.fixture
@@ -69,7 +70,8 @@ from pathlib import Path
 import torch
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.policy import TanhGaussianActor, save_policy
+from envtf_lit.actors import TanhGaussianActor
+from envtf_lit.policy import save_policy
 from envtf_lit.files import write_json
 from tests.walker import walker_dataset
 

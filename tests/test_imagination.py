@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.histories import BranchPoints, Histories
 from envtf_lit.imagination.rollouts import NoisyPolicy, Rollouts, imagine
 from envtf_lit.imagination.store import load_rollouts, save_rollouts
-from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.world_models.observed import as_observed
 from envtf_lit.world_models.transformer import EnvironmentTransformer

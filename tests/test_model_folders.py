@@ -11,10 +11,11 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.errors import UserError
 from envtf_lit.files import write_json
 from envtf_lit.model_folders import load_weights
-from envtf_lit.policy import TanhGaussianActor, load_policy, save_policy
+from envtf_lit.policy import load_policy, save_policy
 from envtf_lit.world_models.options import ModelOptions
 from envtf_lit.world_models.store import load_world_model, save_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.errors import UserError
 from envtf_lit.planning.noise import coloured_noise
 from envtf_lit.planning.objective import Objective, imagined_paths
@@ -22,7 +23,7 @@ from envtf_lit.planning.options import (
 )
 from envtf_lit.planning.registry import PLANNERS
 from envtf_lit.planning.shooting import CEM, MPPI, RandomShooting
-from envtf_lit.policy import StatefulPolicy, TanhGaussianActor
+from envtf_lit.policy import StatefulPolicy
 from envtf_lit.robots.returns import evaluate_policy
 from envtf_lit.robots.tasks import ROBOTS
 from envtf_lit.world_models.interface import Prediction

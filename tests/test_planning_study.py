@@ -10,11 +10,12 @@ import pytest
 import torch
 from PIL import Image
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.cli.main import main
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.planning import score_planner
-from envtf_lit.policy import TanhGaussianActor, save_policy
+from envtf_lit.policy import save_policy
 from envtf_lit.robots.tasks import ROBOTS
 from envtf_lit.studies.planning import FAMILIES, PlanningOptions, planning_table, run_planning
 from envtf_lit.world_models.store import save_world_model

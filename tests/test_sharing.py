@@ -9,11 +9,12 @@ import torch
 from ruamel.yaml import YAML
 
 from envtf_lit import sharing
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.cli.main import main
 from envtf_lit.errors import UserError
 from envtf_lit.files import write_json
 from envtf_lit.model_card import model_card
-from envtf_lit.policy import TanhGaussianActor, load_policy, save_policy
+from envtf_lit.policy import load_policy, save_policy
 from envtf_lit.sharing import ALLOWED, pull, push
 from envtf_lit.world_models.store import load_world_model, save_world_model
 from envtf_lit.world_models.termination_head import TerminationHead, save_termination

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from torch import nn
 
+from envtf_lit.actors import Actor, DeterministicActor
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.files import write_json
-from envtf_lit.policy import Actor, DeterministicActor
 from envtf_lit.robots.returns import evaluate_policy
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.studies.agent_speed import NETS, OPTIONS, agent_on, fit, their_side, write_plain

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit import training
+from envtf_lit.actors import Actor, TanhGaussianActor
 from envtf_lit.agents.divergence import check_means
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.data.datamodules import TransitionData
@@ -18,7 +19,7 @@ from envtf_lit.data.loaders import epoch_generator
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.buffer import ImaginedBatches
 from envtf_lit.options.schema import build
-from envtf_lit.policy import Actor, TanhGaussianActor, load_policy
+from envtf_lit.policy import load_policy
 
 Batch = dict[str, Tensor]
 Logs = dict[str, Tensor]

@@ -7,13 +7,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from envtf_lit.actors import Actor, GaussianActor
 from envtf_lit.agents.actor_critic import ActorCritic
 from envtf_lit.agents.agent import Batch, Logs, Part
 from envtf_lit.agents.networks import PlainStateValue
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.options.numbers import InnerShare, Positive
-from envtf_lit.policy import Actor, GaussianActor
 
 LARGEST_WEIGHT = 100.0  # of a row in the actor's loss
 

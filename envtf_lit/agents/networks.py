@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from envtf_lit.policy import in_fp32, mlp
+from envtf_lit.actors import in_fp32, mlp
 
 
 class StackedLinear(nn.Module):

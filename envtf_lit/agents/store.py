@@ -4,8 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from envtf_lit.actors import Actor
 from envtf_lit.files import replacing
-from envtf_lit.policy import Actor, save_policy
+from envtf_lit.policy import save_policy
 from envtf_lit.training import Curves, record_training
 
 

@@ -8,11 +8,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from envtf_lit.actors import Actor, DeterministicActor
 from envtf_lit.agents.actor_critic import ActorCritic, held_fixed
 from envtf_lit.agents.agent import Batch, Logs, Part, follow
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.options.numbers import Count, NonNegative
-from envtf_lit.policy import Actor, DeterministicActor
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.agents.actor_critic import held_fixed
 from envtf_lit.agents.agent import Agent, Batch, Logs, Phase, follow
 from envtf_lit.agents.networks import StateValue
@@ -16,7 +17,6 @@ from envtf_lit.imagination.histories import Histories
 from envtf_lit.imagination.rollouts import Rollouts, gather_steps
 from envtf_lit.options.numbers import Count, NonNegative, NonzeroShare, Positive
 from envtf_lit.options.schema import rare
-from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.world_models.interface import Prediction
 from envtf_lit.world_models.unroll import Step, lost, unroll
 

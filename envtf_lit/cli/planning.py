@@ -2,11 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from envtf_lit.cli.output import console, hush_lightning
 from envtf_lit.cli.signatures import CORES, File, Folder, Natural, Positive, run_command
 from envtf_lit.errors import UserError
+
+if TYPE_CHECKING:
+    from envtf_lit.evaluation.planning import PlannedReturns
+    from envtf_lit.robots.tasks import Robot
 
 Options = Annotated[tuple[str, ...], "NAME=VALUE"]
 
@@ -52,7 +56,6 @@ def plan(
     if video is not None and dataset is None:
         raise UserError("--video tells the model's error in units of its data: name them with --dataset FILE.")
     import torch
-    from rich.table import Table
 
     from envtf_lit.evaluation.planning import score_planner
     from envtf_lit.files import write_json
@@ -63,18 +66,46 @@ def plan(
         claim(out, "decisions_per_second")
     torch.set_num_threads(threads)
     robot = get_task(task).robot
-    found = score_planner(
-        world_model,
-        robot,
-        planner,
-        option,
-        policy=policy,
-        episodes=episodes,
-        steps=steps,
-        seed=seed,
-        precision=precision,
-        progress=not quiet,
-    )
+    played = dict(policy=policy, episodes=episodes, steps=steps, seed=seed, precision=precision, progress=not quiet)
+    found = score_planner(world_model, robot, planner, option, **played)  # pyright: ignore[reportArgumentType]
+    _print_scores(found, planner, policy)
+    if out is not None:
+        asked = dict(task=task, planner=planner, options=list(option), seed=seed, threads=threads, precision=precision)
+        write_json(out, asked | _rates(found))
+    if video is not None and dataset is None:
+        raise UserError("--video tells the model's error in units of its data: name them with --dataset FILE.")
+    import torch
+
+    from envtf_lit.evaluation.planning import score_planner
+    from envtf_lit.files import write_json
+    from envtf_lit.results import claim
+    from envtf_lit.robots.tasks import get_task
+
+    if out is not None:
+        claim(out, "decisions_per_second")
+    torch.set_num_threads(threads)
+    robot = get_task(task).robot
+    played = dict(policy=policy, episodes=episodes, steps=steps, seed=seed, precision=precision, progress=not quiet)
+    found = score_planner(world_model, robot, planner, option, **played)  # pyright: ignore[reportArgumentType]
+    _print_scores(found, planner, policy)
+    if out is not None:
+        prior = {} if found.prior is None else {"prior_returns": found.prior.returns.tolist()}
+        asked = dict(task=task, planner=planner, options=list(option), seed=seed, threads=threads, precision=precision)
+        rates = {"returns": found.planned.returns.tolist(), "decisions_per_second": found.decisions_per_second}
+        write_json(out, asked | rates | prior)
+    if video is not None and dataset is not None:
+        _draw(found, world_model, robot, dataset, video)
+
+
+def _rates(found: "PlannedReturns") -> dict[str, object]:
+    prior = {} if found.prior is None else {"prior_returns": found.prior.returns.tolist()}
+    rates = {"returns": found.planned.returns.tolist(), "decisions_per_second": found.decisions_per_second}
+    return rates | prior
+
+
+def _print_scores(found: "PlannedReturns", planner: str, policy: Path | None) -> None:
+    from rich.table import Table
+
     table = Table("", "return", "score", "steps", "decisions/s", box=None)
     rate = f"{found.decisions_per_second:.1f}"
     for name, played, speed in ((planner, found.planned, rate), (policy.name if policy else "", found.prior, "")):
@@ -82,19 +113,16 @@ def plan(
             row = played.returns.mean(), played.scores.mean(), played.lengths.mean()
             table.add_row(name, f"{row[0]:.1f}", f"{row[1]:.1f}", f"{row[2]:.0f}", speed)
     console().print(table, soft_wrap=False)
-    if out is not None:
-        prior = {} if found.prior is None else {"prior_returns": found.prior.returns.tolist()}
-        asked = dict(task=task, planner=planner, options=list(option), seed=seed, threads=threads, precision=precision)
-        rates = {"returns": found.planned.returns.tolist(), "decisions_per_second": found.decisions_per_second}
-        write_json(out, asked | rates | prior)
-    if video is not None:
-        from envtf_lit.data.sources.files import load_dataset
-        from envtf_lit.figures.video import real_vs_imagined
-        from envtf_lit.world_models.forecast import Scale
-        from envtf_lit.world_models.store import load_world_model
 
-        scale = Scale.of(load_dataset(str(dataset)))
-        real_vs_imagined(load_world_model(world_model), found.planned.median, get_task(task).robot, scale, video)
+
+def _draw(found: "PlannedReturns", world_model: Path, robot: "Robot", dataset: Path, video: Path) -> None:
+    from envtf_lit.data.sources.files import load_dataset
+    from envtf_lit.figures.video import real_vs_imagined
+    from envtf_lit.world_models.forecast import Scale
+    from envtf_lit.world_models.store import load_world_model
+
+    scale = Scale.of(load_dataset(dataset))
+    real_vs_imagined(load_world_model(world_model), found.planned.median, robot, scale, video)
 
 
 def bench_planning(

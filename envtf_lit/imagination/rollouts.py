@@ -6,8 +6,9 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from envtf_lit.actors import Actor
 from envtf_lit.imagination.histories import Histories
-from envtf_lit.policy import Actor, Policy
+from envtf_lit.policy import Policy
 from envtf_lit.world_models.interface import Mode, WorldModel
 from envtf_lit.world_models.unroll import Step, lost, unroll
 

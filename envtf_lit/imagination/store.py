@@ -9,7 +9,8 @@ from typing import Any
 import h5py
 import torch
 
-from envtf_lit.data.sources.files import check_size, hdf5_bytes, own_hdf5
+from envtf_lit.data.sources.files import hdf5_bytes, own_hdf5
+from envtf_lit.data.sources.raw import check_size
 from envtf_lit.errors import UserError
 from envtf_lit.files import check_plain, replacing
 from envtf_lit.imagination.rollouts import Rollouts

@@ -43,18 +43,14 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
     are no scores: what the model estimates for the policies, and how they agree with held-out actions, is all. The
     video shows the last policy of `train_policy`.
     """
-    options, name, robot, source = (
-        params.evaluate,
-        params.evaluate.world_model,
-        robot_of(params),
-        params.download.source,
-    )
+    options, name = params.evaluate, params.evaluate.world_model
+    robot, source = robot_of(params), params.download.source
     with run_stage("evaluate", params, root):
         dataset, rollouts = load_dataset(dataset_of(params, root)), load_rollouts(rollouts_file(root, name))
         folder = root / WORLD_MODELS / name
         model = load_world_model(folder)
         training, held_out = dataset.split()
-        _, held_out = held_out.validation_and_test()
+        held_out = held_out.validation_and_test()[1]
         scale = Scale.of(training)
         report = horizon_report(model, whole_episodes(held_out, options.trajectories, seed=params.seed), scale)
         folders = {policy: root / POLICIES / policy for policy in params.train_policy}

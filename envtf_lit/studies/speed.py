@@ -16,13 +16,13 @@ from typing import Any
 import torch
 from torch import nn
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.files import write_json
 from envtf_lit.imagination.histories import Histories
 from envtf_lit.imagination.rollouts import imagine
 from envtf_lit.options.schema import Precision
 from envtf_lit.pipeline.generate_rollouts import STRETCH
 from envtf_lit.pipeline.yaml import preset_params
-from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.results import claim
 from envtf_lit.robots.tasks import ROBOTS, Robot
 from envtf_lit.robots.termination import never_terminated

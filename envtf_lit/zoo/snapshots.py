@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.errors import UserError
 from envtf_lit.files import read_json, recover
 from envtf_lit.model_folders import load_weights
-from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.robots.hidden_dynamics import HIGH, LOW
 from envtf_lit.robots.tasks import ROBOTS, Robot, Task
 

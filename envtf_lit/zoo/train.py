@@ -12,9 +12,9 @@ import torch
 from rich.progress import MofNCompleteColumn, TextColumn
 from safetensors.torch import save
 
+from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.errors import UserError, missing_extra
 from envtf_lit.files import read_json, replacing, write_json
-from envtf_lit.policy import TanhGaussianActor
 from envtf_lit.progress import progress_bar
 from envtf_lit.robots.returns import evaluate_policy
 from envtf_lit.robots.tasks import Robot

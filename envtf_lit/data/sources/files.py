@@ -10,7 +10,6 @@ import warnings
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -22,49 +21,16 @@ from envtf_lit.data.checks import build_dataset
 from envtf_lit.data.columns import Column, FileRows, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.findings import Finding
+from envtf_lit.data.sources.raw import ALIASES, ATTRIBUTES, HELD_OUT, LARGEST_ATTRIBUTE, Raw, check_size
 from envtf_lit.errors import UserError
 from envtf_lit.files import replacing
 
-# the first name is the one that we write
-ALIASES = {
-    "observations": ("observations",),
-    "actions": ("actions",),
-    "rewards": ("rewards",),
-    "next_observations": ("next_observations",),
-    "terminated": ("terminals", "terminated"),
-    "truncated": ("timeouts", "truncated"),
-    "episode_index": ("episode_index", "episode", "episode_id", "episode_ids"),
-}
-ATTRIBUTES = ("task", "action_low", "action_high")
 ALL_PLACES = tuple(place for places in PLACES.values() for place in places)
-HELD_OUT = "held_out"  # (E,), for each episode whether it is held out
 HDF5_ENDINGS, NPZ_ENDINGS = (".h5", ".hdf5"), (".npz",)
 HDF5_FILTERS = {1, 2, 3, 4, 5, 6, 32000}  # gzip, shuffle, fletcher32, szip, nbit, scaleoffset, lzf: no plugins
-# no log of numbers shrinks to a 200th: a file that declares more than this, and more than that, is damaged or a trap
-BOMB_RATIO, BOMB_BYTES = 200, 256 << 20
-LARGEST_ATTRIBUTE = 1 << 20  # bytes
 ODD = "neither a short text nor a few numbers"
 # of a file with more than this, columns of more than a quarter of it stay there and are read as they are needed
 RESIDENT_BYTES = 256 << 20
-
-
-@dataclass
-class Raw:
-    """What a file holds, as it lies there.
-
-    Attributes:
-        columns: by our names; arrays, or what has `shape`, `dtype` and slices like one while the file is open.
-        attributes: `task`, `action_low`, `action_high`, `held_out`, where there are such.
-        ignored: names of everything else.
-        broken: columns that are there and cannot be read, by our names, and why.
-        notes: what reading them changed.
-    """
-
-    columns: dict[str, Any] = field(default_factory=dict)
-    attributes: dict[str, Any] = field(default_factory=dict)
-    ignored: list[str] = field(default_factory=list)
-    broken: dict[str, Finding] = field(default_factory=dict)
-    notes: list[Finding] = field(default_factory=list)
 
 
 def save_dataset(dataset: OfflineDataset, path: str | Path) -> None:
@@ -190,21 +156,6 @@ def _find_names(present: Iterable[str]) -> tuple[dict[str, str], list[str]]:
     }
     known = {*found.values(), "task", HELD_OUT, *ALL_PLACES}
     return found, [name for name in there if name not in known]
-
-
-def check_size(path: Path, declared: dict[str, int]) -> None:
-    """Refuses sizes (bytes of each array) that make a small file a large one.
-
-    Raises:
-        UserError: the file declares hundreds of times what it holds.
-    """
-    total, stored = sum(declared.values()), path.stat().st_size
-    if total > BOMB_BYTES and total > BOMB_RATIO * stored:
-        name = max(declared, key=lambda key: declared[key])
-        raise UserError(
-            f"{path} has {stored:,} bytes and declares {declared[name]:,} of {name!r}: it is damaged or a trap that "
-            "fills the memory; fetch or write it anew."
-        )
 
 
 # HDF5

@@ -3,9 +3,10 @@
 import contextlib
 from pathlib import Path
 
-from envtf_lit.data.sources.files import Raw, open_raw
+from envtf_lit.data.sources.files import open_raw
 from envtf_lit.data.sources.minari import MINARI, minari_raw
 from envtf_lit.data.sources.parquet import PARQUET, is_lerobot, read_parquet
+from envtf_lit.data.sources.raw import Raw
 from envtf_lit.data.sources.tables import CSV, read_csv
 
 

@@ -19,7 +19,8 @@ import numpy as np
 from envtf_lit.data.checks import build_dataset
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.sources.fetch import fingerprint
-from envtf_lit.data.sources.files import Raw, check_size, hdf5_bytes, own_hdf5
+from envtf_lit.data.sources.files import hdf5_bytes, own_hdf5
+from envtf_lit.data.sources.raw import Raw, check_size
 from envtf_lit.errors import UserError
 from envtf_lit.files import replacing
 from envtf_lit.robots.hidden_dynamics import HiddenDynamics

@@ -12,7 +12,7 @@ import numpy as np
 from envtf_lit.data.columns import blocks
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.findings import Finding
-from envtf_lit.data.sources.files import ATTRIBUTES, HELD_OUT, LARGEST_ATTRIBUTE, Raw, check_size
+from envtf_lit.data.sources.raw import ATTRIBUTES, HELD_OUT, LARGEST_ATTRIBUTE, Raw, check_size
 from envtf_lit.data.sources.tables import TABLE_ALIASES, explain_done, find_columns, gaps
 from envtf_lit.errors import UserError, missing_extra
 from envtf_lit.files import replacing

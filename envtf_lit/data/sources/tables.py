@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from envtf_lit.data.findings import Finding
-from envtf_lit.data.sources.files import ALIASES, Raw
+from envtf_lit.data.sources.raw import ALIASES, Raw
 from envtf_lit.errors import UserError
 
 CSV = ".csv"
