@@ -118,6 +118,7 @@ def test_the_plain_network_has_the_transformers_parameters() -> None:
     assert sizes[0] == pytest.approx(sizes[1], rel=0.01)
 
 
+@pytest.mark.slow
 def test_cost_is_counted_to_an_error_that_all_reach(tmp_path: Path) -> None:
     ensemble = EnsembleOptions(
         members=3, elites=2, hidden=(8,), weight_decay=(0, 0), updates=6, updates_per_epoch=2, batch_size=8

@@ -253,6 +253,7 @@ def test_a_disk_that_is_full_of_checkpoints_is_said_in_a_sentence(tiny_download:
     assert not list(tmp_path.rglob("*.ckpt")) and not list(tmp_path.rglob("published"))
 
 
+@pytest.mark.slow
 def test_a_rendering_back_end_that_is_not_there_stops_neither_stage_nor_doctor(project: Path) -> None:
     run(project, "download", "--quiet", "--download.transitions=1000", MUJOCO_GL="osmesa")
     assert (project / "data/dataset.h5").exists()

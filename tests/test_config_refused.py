@@ -140,9 +140,10 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 def test_a_file_that_cannot_be_read_is_said_to_be_so(tmp_path: Path) -> None:
     (tmp_path / "latin.yaml").write_bytes(b"task: \xe9")
-    for path in (tmp_path, tmp_path / "latin.yaml"):
-        with pytest.raises(UserError, match=rf"Cannot read {path} .*: give a YAML file\."):
-            load_params(path)
+    with pytest.raises(UserError, match=r"Cannot read .*latin\.yaml .*: give a YAML file\."):
+        load_params(tmp_path / "latin.yaml")
+    with pytest.raises(UserError, match=r"is not a file, but a folder, a pipe or a device: give a file\."):
+        load_params(tmp_path)
 
 
 @pytest.mark.parametrize("override", ["seed", "=1", ""])

@@ -118,7 +118,7 @@ def test_absurd_sizes_end_in_a_sentence_before_any_memory_is_taken(tmp_path: Pat
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 48,)})
     with zipfile.ZipFile(write(tmp_path / "header.npz", content), "a") as archive:
         archive.writestr("rewards.npy", header.getvalue() + bytes(96))
-    monkeypatch.setattr("envtf_lit.data.sources.files.BOMB_BYTES", 1 << 20)
+    monkeypatch.setattr("envtf_lit.data.sources.raw.BOMB_BYTES", 1 << 20)
     np.savez_compressed(tmp_path / "zeros.npz", allow_pickle=False, **content, rewards=np.zeros(1 << 20))
     for name, message in (
         ("bomb.h5", "a trap"),

@@ -307,6 +307,7 @@ def test_members_are_kept_at_their_best_and_the_best_are_elites():
     assert int(lit.stale) == 1
 
 
+@pytest.mark.slow
 def test_fused_steps_equal_plain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     through_dynamo = partial(torch.compile, backend="eager")
     plain, fused = make_ensemble(), make_ensemble()

@@ -79,6 +79,7 @@ def test_every_plot_is_a_picture_with_its_numbers(drawn):
         assert len(pd.read_csv(path)) > 0
 
 
+@pytest.mark.slow
 def test_plots_have_the_same_bytes_every_time(drawn, tmp_path):
     np.random.seed(1)  # noqa: NPY002 -- no plot may depend on the global generators
     torch.manual_seed(1)

@@ -23,6 +23,7 @@ ENSEMBLE = EnsembleOptions(
 TINY = SuiteOptions(transitions=1_000, updates=2, context=20, ensemble=ENSEMBLE, threads=1)
 
 
+@pytest.mark.slow
 def test_models_are_measured_on_draws_that_none_has_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lines = list[str]()
     facts: dict[str, Any] = dict(tier="medium", work=tmp_path, options=TINY, progress=False, report=lines.append)

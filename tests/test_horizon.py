@@ -136,6 +136,7 @@ def test_what_cannot_be_measured_is_refused_before_any_work(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_episodes")
 def test_variants_are_trained_and_measured_beside_the_suite(tmp_path: Path) -> None:
     out, names = tmp_path / "ablation.json", ["context_8", "updates_x2"]

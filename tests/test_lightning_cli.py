@@ -183,6 +183,7 @@ def another_robot() -> None:
     save_dataset(data, "data/dataset.h5")
 
 
+@pytest.mark.slow
 def test_another_robots_model_keeps_the_frozen_trunk_and_needs_no_flag_for_the_architecture(folder: Path) -> None:
     fit("model")
     Path(".envtf/published").rename("first")

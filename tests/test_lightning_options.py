@@ -46,6 +46,7 @@ def test_agents_that_imagine_are_refused(algorithm: str, folder: Path, capsys: p
     assert "world_model is transformer" in refused(capsys, "agent", "fit", NO_LOGGER, world_model="transformer")
 
 
+@pytest.mark.slow
 def test_a_model_is_of_the_kind_of_what_it_starts_from(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fit_ensemble("--model.kind=ensemble")
     Path(".envtf/published").rename("first")

@@ -79,6 +79,7 @@ def test_a_policy_of_another_robot_is_refused(hopper_model: Path, tmp_path: Path
         score_planner(hopper_model / "model", ROBOTS["hopper"], "mppi", policy=tmp_path / "policy", episodes=1, seed=0)
 
 
+@pytest.mark.slow
 def test_the_study_measures_every_family_and_draws_a_plan(tmp_path: Path):
     """Through a model that was hardly trained, in episodes too short to swing up."""
     options = PlanningOptions(transitions=400, updates=2, episodes=1, steps=10, decisions=1)

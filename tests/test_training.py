@@ -244,6 +244,7 @@ def test_the_training_metric_is_what_the_saved_model_scores(root):
     assert error == pytest.approx(metrics["open_loop_error"], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_two_processes_with_one_seed_write_the_same_bytes(tmp_path):
     outputs = []
     for name in ("one", "two"):

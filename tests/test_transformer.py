@@ -380,6 +380,7 @@ def test_without_dropout_the_loss_draws_nothing():
     assert torch.equal(torch.get_rng_state(), before)
 
 
+@pytest.mark.slow
 def test_fused_steps_equal_plain_ones(monkeypatch: pytest.MonkeyPatch):
     # what inductor makes of the graphs is its own business
     through_dynamo = partial(torch.compile, backend="eager")

@@ -198,6 +198,7 @@ def test_a_checkpoint_runs_nothing(
     assert "changed.ckpt" in check_refused(capsys, ran, kind, sound, "--ckpt_path=changed.ckpt")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("injection", INJECTIONS)
 @pytest.mark.parametrize(
     ("kind", "position"),
