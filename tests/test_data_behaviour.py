@@ -254,7 +254,7 @@ def test_experts_are_experts(name: str, score: float):
     assert ROBOTS[name].normalised_score(read_series(ROBOTS[name]).expert.mean_return) >= score
 
 
-@pytest.mark.parametrize("robot", [ROBOTS["halfcheetah"], ROBOTS["walker2d"]], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [ROBOTS["halfcheetah"]], ids=lambda robot: robot.name)
 def test_experts_return_what_is_recorded(robot: Robot):
     check_returns(robot, read_series(robot).expert.steps, episodes=2)
 
