@@ -43,7 +43,7 @@ else
 endif
 
 test: .venv/.installed-dev
-	pytest -q -n auto --dist loadfile  # what a file sets up, one process sets up
+	pytest -q -n auto
 
 test-all: .venv/.installed-dev
 	pytest -q -n auto -m "slow or not slow"
