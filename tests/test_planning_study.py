@@ -46,7 +46,9 @@ def test_envtf_plan_plays_a_planner_beside_its_prior(
 ):
     out = tmp_path / "plan.json"
     main(envtf_plan(hopper_model, "--policy", str(hopper_model / "policy"), "--out", str(out)))
-    assert re.search(r"mppi +-?[\d.]+ +-?[\d.]+ +5 +[\d.]+ *\n *policy ", capsys.readouterr().out)
+    said = capsys.readouterr().out
+    assert re.search(r"mppi +-?[\d.]+ +-?[\d.]+ +5 +[\d.]+ *\n *policy ", said)
+    assert said.count("mppi") == 1  # it is played once
     found = json.loads(out.read_text())
     assert found["options"] == ["horizon=3", "samples=8"] and found["decisions_per_second"] > 1
     assert len(found["returns"]) == len(found["prior_returns"]) == 1

@@ -72,27 +72,6 @@ def plan(
     if out is not None:
         asked = dict(task=task, planner=planner, options=list(option), seed=seed, threads=threads, precision=precision)
         write_json(out, asked | _rates(found))
-    if video is not None and dataset is None:
-        raise UserError("--video tells the model's error in units of its data: name them with --dataset FILE.")
-    import torch
-
-    from envtf_lit.evaluation.planning import score_planner
-    from envtf_lit.files import write_json
-    from envtf_lit.results import claim
-    from envtf_lit.robots.tasks import get_task
-
-    if out is not None:
-        claim(out, "decisions_per_second")
-    torch.set_num_threads(threads)
-    robot = get_task(task).robot
-    played = dict(policy=policy, episodes=episodes, steps=steps, seed=seed, precision=precision, progress=not quiet)
-    found = score_planner(world_model, robot, planner, option, **played)  # pyright: ignore[reportArgumentType]
-    _print_scores(found, planner, policy)
-    if out is not None:
-        prior = {} if found.prior is None else {"prior_returns": found.prior.returns.tolist()}
-        asked = dict(task=task, planner=planner, options=list(option), seed=seed, threads=threads, precision=precision)
-        rates = {"returns": found.planned.returns.tolist(), "decisions_per_second": found.decisions_per_second}
-        write_json(out, asked | rates | prior)
     if video is not None and dataset is not None:
         _draw(found, world_model, robot, dataset, video)
 
