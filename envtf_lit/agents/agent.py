@@ -219,9 +219,8 @@ class Agent(L.LightningModule, ABC):
         optimizer.zero_grad(set_to_none=True)
         self.manual_backward(loss)
         if clip is not None:
-            nn.utils.clip_grad_norm_(
-                self.parts()[part].module.parameters(), clip
-            )  # Lightning's refuses fused optimisers
+            # not by Lightning, whose clipping refuses fused optimisers
+            nn.utils.clip_grad_norm_(self.parts()[part].module.parameters(), clip)
         optimizer.step()
 
     def optimizer(self, part: str) -> Any:

@@ -98,7 +98,9 @@ def agent_of(algorithm: str) -> Callable[..., Agent]:
 class _Sourced:
     """Reads a dataset from where `source` says."""
 
-    source: Literal["file", "minari"]
+    def __init__(self, path: str, source: Literal["file", "minari"] = "file", **options: Any) -> None:
+        self.source = source
+        super().__init__(path, **options)  # pyright: ignore[reportCallIssue]  # of the data module beside it
 
     def read(self, path: str) -> OfflineDataset:
         """A file, or a Minari dataset of this machine; the network is for `envtf download` alone."""
@@ -114,10 +116,6 @@ class LogWindows(_Sourced, WindowData):
         options: see `WindowData`.
     """
 
-    def __init__(self, path: str, source: Literal["file", "minari"] = "file", **options: Any) -> None:
-        self.source = source
-        super().__init__(path, **options)
-
 
 class LogTransitions(_Sourced, TransitionData):
     """Transitions of a log, for agents.
@@ -127,7 +125,3 @@ class LogTransitions(_Sourced, TransitionData):
         source: which of the two: `file` or `minari`.
         options: see `TransitionData`.
     """
-
-    def __init__(self, path: str, source: Literal["file", "minari"] = "file", **options: Any) -> None:
-        self.source = source
-        super().__init__(path, **options)

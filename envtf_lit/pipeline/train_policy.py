@@ -54,7 +54,8 @@ def train_policy(
         algorithm = ALGORITHMS[algorithm_of(options)]
         if isinstance(options, ImaginingOptions):
             options = within_reach(options, root / WORLD_MODELS / options.world_model)
-        data = transition_data(dataset_of(params, root), options, seed=params.seed, **unseen(params))
+        dataset = dataset_of(params, root)
+        data = transition_data(dataset, options, seed=params.seed, **unseen(params))
         agent = algorithm(
             data.observation_dim,
             data.action_dim,
@@ -64,7 +65,7 @@ def train_policy(
             seed=params.seed,
             source=imagined_batches(params, root, options, data) if algorithm.imagines else None,
         )
-        inputs = [dataset_of(params, root)]
+        inputs = [dataset]
         if algorithm.imagines:
             inputs += [root / WORLD_MODELS / options.world_model, rollouts_file(root, options.world_model)]
         settings = run_settings(params, options) | {"algorithm": algorithm_of(options)}
