@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from envtf_lit.agents.agent import Batch
+from envtf_lit.agents.phases import Batch
 from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.imagination.rollouts import Rollouts

@@ -8,12 +8,14 @@ from typing import Any
 import pytest
 import torch
 
-from envtf_lit.agents.agent import Agent, Losses
+from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.bc import BC
 from envtf_lit.agents.combo import COMBO
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.et_cql import ETCQL, ETCQLPaper
+from envtf_lit.agents.phases import Losses
 from envtf_lit.agents.sac import SAC
+from envtf_lit.agents.scales import LogReturns
 from envtf_lit.agents.value_gradient import ValueGradientOptions
 from envtf_lit.agents.warm_start import LEARNING_RATE as WARM_RATE
 from envtf_lit.errors import UserError
@@ -196,7 +198,7 @@ def test_what_is_not_finite_stops_a_run(name, value):
 @pytest.mark.parametrize("name", ["q_data", "q_target", "q_policy"])
 def test_values_beyond_what_rewards_allow_stop_a_run(name):
     agent = hand_driven(SAC)
-    agent.largest_return = 3.0 / (1.0 - 0.99)  # rewards of at most three
+    agent.log_returns = LogReturns(largest=3.0 / (1.0 - 0.99))  # rewards of at most three
     agent.return_scale.fill_(100.0)
     after_an_epoch(agent, **{name: 6.9})  # twice that, and what a network says that has learned nothing
     after_an_epoch(agent, **{name: -1e6}, conservative_gap=1e6)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from envtf_lit.agents import value_gradient
 from envtf_lit.agents.et_cql import ETCQL
+from envtf_lit.agents.scales import LogReturns
 from envtf_lit.agents.value_gradient import (
     BETAS,
     LOST,
@@ -167,7 +168,7 @@ def improved(penalty: float, limit: float | None) -> tuple[float, float]:
     agent, batch = make_agent(penalty=penalty, novelty_limit=limit), log_batch()
     agent.source.imagination.model = Known(**vars(linear_world()))
     agent.source.imagination.reward_std = 1.0
-    agent.return_spread = 58.0 / (1.0 - 0.9**2) ** 0.5  # of such rewards, where a log's actions are uniform
+    agent.log_returns = LogReturns(spread=58.0 / (1.0 - 0.9**2) ** 0.5)  # of such rewards, under random actions
     for _ in range(40):
         found = agent.update(batch)
         agent.update_index += 1

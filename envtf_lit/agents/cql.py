@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from envtf_lit.agents.agent import Batch, Logs
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs
 from envtf_lit.agents.sac import SAC, SACOptions
 from envtf_lit.options.numbers import Count, NonNegative, Positive
 from envtf_lit.options.schema import rare

@@ -6,10 +6,10 @@ from typing import ClassVar, Self
 
 from torch import Tensor
 
-from envtf_lit.agents.agent import Batch, Logs, Losses, Part, Phase
 from envtf_lit.agents.combo import COMBO, ImaginingOptions
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs, Losses, Part, Phase
 from envtf_lit.agents.value_gradient import (
     BETAS,
     LEARNING_RATE,

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.agents.actor_critic import held_fixed
-from envtf_lit.agents.agent import Agent, Batch, Logs, Phase, follow
+from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.networks import StateValue
+from envtf_lit.agents.phases import Batch, Logs, Phase, follow
 from envtf_lit.imagination.buffer import Imagination
 from envtf_lit.imagination.histories import Histories
 from envtf_lit.imagination.rollouts import Rollouts, gather_steps
@@ -251,7 +252,7 @@ class ValueGradient(Phase):
     def value_gradient_step(self, agent: Agent, batch: Batch, done: int) -> Logs:
         """One step of the actor along the gradient, and several of the state value."""
         values, discount = self.values, agent.options.discount
-        spread = agent.return_spread / agent.return_scale
+        spread = agent.log_returns.spread / agent.return_scale
         assert isinstance(agent.actor, TanhGaussianActor)
         paths = self.paths.next(agent.actor, agent.return_scale, agent.generator)
         with held_fixed(values.value):

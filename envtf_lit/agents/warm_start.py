@@ -1,6 +1,7 @@
 """The warm start: before an algorithm's own losses, values fit the log's returns and the actor clones its actions."""
 
-from envtf_lit.agents.agent import Agent, Batch, Logs, Phase
+from envtf_lit.agents.agent import Agent
+from envtf_lit.agents.phases import Batch, Logs, Phase
 
 LEARNING_RATE = 0.001  # Adam's, of all that learns here
 
