@@ -3,6 +3,7 @@
 import copy
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,6 +21,7 @@ from envtf_lit.agents.value_gradient import ValueGradientOptions
 from envtf_lit.agents.warm_start import LEARNING_RATE as WARM_RATE
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.options import RolloutOptions
+from envtf_lit.training import Guard
 from tests.hand_driven import B, flat, hand_driven, imagined_batches, imagining, make_batch
 
 IMAGINING = [(COMBO, {}), (ETCQLPaper, {}), (ETCQL, {"value_gradient": None})]
@@ -183,15 +185,19 @@ def test_imagined_rows_enter_the_losses_alone():
 
 
 def after_an_epoch(agent: Any, **means: float) -> None:
+    """What an agent's own hook logs, and the guard that every training has behind it."""
     agent.effective_episodes, agent.logged = 5.0, {name: [torch.tensor(value)] for name, value in means.items()}
-    agent.log_dict = lambda *_: None
+    metrics: dict[str, torch.Tensor] = {}
+    agent.log_dict = metrics.update
     agent.on_train_epoch_end()
+    trainer: Any = SimpleNamespace(callback_metrics=metrics, current_epoch=0)
+    Guard().on_train_epoch_end(trainer, agent)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("name", ["clone_loss", "q_data"])
 def test_what_is_not_finite_stops_a_run(name, value):
-    with pytest.raises(UserError, match=f"CQL diverged in epoch 1: {name} is {value}, .* raise cql_weight, or lower"):
+    with pytest.raises(UserError, match=f"CQL diverged in epoch 1: train/{name} is {value}, .* raise cql_weight"):
         after_an_epoch(hand_driven(CQL), **{"q_target": 1.0, name: value})
 
 
@@ -202,10 +208,10 @@ def test_values_beyond_what_rewards_allow_stop_a_run(name):
     agent.return_scale.fill_(100.0)
     after_an_epoch(agent, **{name: 6.9})  # twice that, and what a network says that has learned nothing
     after_an_epoch(agent, **{name: -1e6}, conservative_gap=1e6)
-    with pytest.raises(UserError, match=rf"{name} is 7\.1, where rewards allow 3 .* lower critic_learning_rate"):
+    with pytest.raises(UserError, match=rf"train/{name} is 7\.1, where rewards allow 3 .* lower critic_learning_rate"):
         after_an_epoch(agent, **{name: 7.1})
 
 
 def test_the_value_gradient_has_cures_of_its_own():
-    with pytest.raises(UserError, match=r"imagined_value is nan.* lower value_gradient\.learning_rate, or shorten"):
+    with pytest.raises(UserError, match=r"train/imagined_value is nan.* lower value_gradient\.learning_rate"):
         after_an_epoch(et_cql(2, 3), imagined_value=float("nan"))

@@ -7,7 +7,6 @@ from torch import Tensor, nn
 
 from envtf_lit import training
 from envtf_lit.agents.algorithm import Algorithm
-from envtf_lit.agents.divergence import check_means
 from envtf_lit.agents.phases import Batch, Logs
 from envtf_lit.agents.scales import LogReturns, scale_observations
 from envtf_lit.data.datamodules import TransitionData
@@ -106,8 +105,6 @@ class Agent(Algorithm):
 
     def on_train_epoch_end(self) -> None:
         means = {name: torch.stack(values).mean() for name, values in self.logged.items()}
-        largest = self.log_returns.largest / float(self.return_scale)
-        check_means(means, largest, self.label, self.current_epoch + 1, self.cures)
         logs = means | {"effective_episodes": torch.tensor(self.effective_episodes)}
         self.log_dict({f"train/{name}": value for name, value in logs.items()})
 

@@ -15,6 +15,7 @@ from envtf_lit.actors import Actor, TanhGaussianActor
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.phases import Batch, Logs, Losses, Part, Phase, follow
 from envtf_lit.agents.scales import LogReturns
+from envtf_lit.divergence import Bound
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.buffer import ImaginedBatches
 from envtf_lit.options.schema import build
@@ -29,7 +30,7 @@ class Algorithm(L.LightningModule, ABC):
         Options: the algorithm's own dataclass of options.
         label: its name in figures and tables.
         imagines: whether it learns from a world model, too.
-        cures: what helps most against divergence, by the logged name; see `divergence.check_means`.
+        cures: what helps most against divergence, by the logged name; see `divergence.check_epoch`.
         actor_kind: of its policy.
         log_returns: what they are like in the dataset.
 
@@ -145,6 +146,11 @@ class Algorithm(L.LightningModule, ABC):
     def update_targets(self) -> None:
         """After each update of the losses: the averaged actor follows the actor."""
         follow(self.average_actor, self.actor, self.options.actor_average)
+
+    @property
+    def bounds(self) -> dict[str, Bound]:
+        """What no logged values of a sound training are above; see `divergence.check_epoch`."""
+        return self.log_returns.bounds(float(self.return_scale))
 
     def clone_loss(self, batch: Batch) -> Tensor:
         """The actor's distance from the recorded actions (`Actor.clone_error`), mean over the real rows."""

@@ -7,8 +7,11 @@ from typing import Any, Self
 from torch import Tensor, nn
 
 from envtf_lit.data.datamodules import TransitionData
+from envtf_lit.divergence import Bound
 
 EQUAL = 1e-3  # of a typical return, up to which a spread of returns is rounding, or as good as none
+SLACK, ROUGH = 2.0, 1.0  # factor, and values of a network that has learned nothing yet, by which the bound is wide
+VALUES = ("q_data", "q_target", "q_policy")  # logged means that are values, in units of the return scale
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,15 @@ class LogReturns:
         if spread <= EQUAL * abs(typical):
             spread = abs(typical) or 1.0
         return cls(typical, spread, float(abs(data.dataset.rewards).max()) / (1.0 - discount))
+
+    def bounds(self, scale: float) -> dict[str, Bound]:
+        """What no policy's values can be, by their logged names, where returns are divided by `scale`.
+
+        Upwards alone: conservative terms push values of unseen actions down as far as they like.
+        """
+        largest = self.largest / scale
+        cause = f"where rewards allow {largest:.3g} (max |reward| / (1 - discount)), so values feed on themselves"
+        return dict.fromkeys((f"train/{name}" for name in VALUES), Bound(SLACK * largest + ROUGH, cause))
 
 
 def scale_observations(module: nn.Module, mean: Tensor, std: Tensor) -> None:
