@@ -1,7 +1,6 @@
 """One way to train a LightningModule: resumable, quiet or with a progress bar, and leaving nothing half-written."""
 
 import contextlib
-import csv
 import ctypes
 import hashlib
 import io
@@ -22,7 +21,7 @@ from torch import nn
 
 from envtf_lit.divergence import check_epoch
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.files import check_writable, replacing, write_json
+from envtf_lit.files import check_writable, replacing, write_json, write_table
 from envtf_lit.options.schema import Precision
 
 logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # says what hardware there is at every fit
@@ -72,11 +71,7 @@ class Curves(Checkpoint):
 
     def write(self, path: Path) -> None:
         """Writes the rows as CSV; a metric that an epoch did not log is left empty."""
-        names = dict.fromkeys(name for row in self.rows for name in row)
-        with replacing(path) as temporary, temporary.open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, names)
-            writer.writeheader()
-            writer.writerows(self.rows)
+        write_table(path, self.rows)
 
 
 class Guard(Checkpoint):

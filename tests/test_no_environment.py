@@ -119,6 +119,7 @@ def own_params(path: Path) -> Params:
     assert isinstance(policies["et_cql"], ETCQLOptions)
     policies["et_cql"] = replace(
         policies["et_cql"],
+        critic_updates=15,
         rollouts=GuardedRolloutOptions(history=2),
         value_gradient=ValueGradientOptions(updates=5, rollouts=5, horizon=3),
     )

@@ -41,6 +41,7 @@ MODEL = TransformerOptions(
 SIZES: dict[str, Any] = dict(updates=40, updates_per_epoch=10, batch_size=16, hidden=(16, 16), warm_start=0.25)
 ET_CQL = ETCQLOptions(
     **SIZES,
+    critic_updates=15,
     rollouts=GuardedRolloutOptions(history=2),
     value_gradient=ValueGradientOptions(updates=15, rollouts=5, horizon=3),
 )
@@ -159,13 +160,7 @@ def imagined(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("name", "epoch"),
-    [
-        ("bc", 2),
-        ("cql", 2),
-        ("et_cql", 1),
-        ("et_cql", 2),
-        ("et_cql", 3),
-    ],  # after warm start, amid the critics' phase, amid the rest
+    [("bc", 2), ("cql", 2), ("et_cql", 1), ("et_cql", 2), ("et_cql", 3)],  # after the warm start, amid the rest
 )
 def test_a_killed_policy_run_resumes_to_the_same_bits(imagined, monkeypatch, name, epoch):
     train = lambda: train_policy(TINY, imagined, name=name, progress=False)  # noqa: E731

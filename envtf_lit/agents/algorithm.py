@@ -30,6 +30,7 @@ class Algorithm(L.LightningModule, ABC):
         Options: the algorithm's own dataclass of options.
         label: its name in figures and tables.
         imagines: whether it learns from a world model, too.
+        watches: whether it watches held-out episodes, which it then doesn't learn from, whatever the task.
         cures: what helps most against divergence, by the logged name; see `divergence.check_epoch`.
         actor_kind: of its policy.
         log_returns: what they are like in the dataset.
@@ -51,6 +52,7 @@ class Algorithm(L.LightningModule, ABC):
     Options: ClassVar[type[PolicyOptions]]
     label: ClassVar[str]
     imagines: ClassVar[bool] = False
+    watches: ClassVar[bool] = False
     cures: ClassVar[Mapping[str, str]] = {"": "lower actor_learning_rate, or look for outliers with `envtf data check`"}
     actor_kind: ClassVar[type[Actor]] = TanhGaussianActor
 
@@ -159,4 +161,8 @@ class Algorithm(L.LightningModule, ABC):
 
     def validation_logs(self, batch: Batch) -> Logs:
         """Further scalars to log of held-out rows."""
+        return {}
+
+    def records(self) -> dict[str, list[dict[str, Any]]]:
+        """Tables to publish beside the policy, by name; each row's columns are alike."""
         return {}

@@ -16,8 +16,8 @@ from envtf_lit.options.schema import rare
 
 
 @dataclass(frozen=True)
-class CQLOptions(SACOptions):
-    """Conservative Q-Learning's own options.
+class ConservativeOptions(PolicyOptions):
+    """Options of the conservative term.
 
     Attributes:
         cql_weight: weight of the conservative term. In units of Q as the critics learn it, which `normalise_returns`
@@ -32,6 +32,11 @@ class CQLOptions(SACOptions):
     cql_weight: NonNegative = 0.1
     cql_temperature: Positive = rare(1.0)
     sampled_actions: Count = rare(2)
+
+
+@dataclass(frozen=True)
+class CQLOptions(ConservativeOptions, SACOptions):
+    """Conservative Q-Learning has the options of its term, and soft actor-critic's."""
 
 
 class CQL(SAC):

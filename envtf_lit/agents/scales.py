@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.divergence import Bound
 
+LOW = 0.05  # share of the rows whose returns are below `LogReturns.low`
 EQUAL = 1e-3  # of a typical return, up to which a spread of returns is rounding, or as good as none
 SLACK, ROUGH = 2.0, 1.0  # factor, and values of a network that has learned nothing yet, by which the bound is wide
 VALUES = ("q_data", "q_target", "q_policy")  # logged means that are values, in units of the return scale
@@ -21,11 +22,13 @@ class LogReturns:
     Attributes:
         typical: their mean; see `loaders.Transitions`.
         spread: their standard deviation, above zero.
+        low: that only one row in twenty falls short of.
         largest: that any policy can have, `max |r| / (1 - discount)`.
     """
 
     typical: float = 0.0
     spread: float = 1.0
+    low: float = 0.0
     largest: float = math.inf
 
     @classmethod
@@ -35,7 +38,8 @@ class LogReturns:
         spread = float(returns.std(correction=0))
         if spread <= EQUAL * abs(typical):
             spread = abs(typical) or 1.0
-        return cls(typical, spread, float(abs(data.dataset.rewards).max()) / (1.0 - discount))
+        low = float(returns.kthvalue(max(1, round(LOW * len(returns)))).values)
+        return cls(typical, spread, low, float(abs(data.dataset.rewards).max()) / (1.0 - discount))
 
     def bounds(self, scale: float) -> dict[str, Bound]:
         """What no policy's values can be, by their logged names, where returns are divided by `scale`.

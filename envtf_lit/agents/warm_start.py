@@ -16,8 +16,16 @@ class WarmStart(Phase):
         logs: Logs = {}
         batch = agent.complete_returns(batch)
         for part, loss, found in agent.warm_start_losses(batch):
-            agent.descend(part, loss, rate=LEARNING_RATE)
+            agent.descend(part, loss, rate=self.rate(done))
             logs |= found
         if done == self.updates - 1:
-            agent.end_warm_start()
+            self.finish(agent)
         return logs
+
+    def rate(self, done: int) -> float:
+        """The learning rate after so many updates."""
+        return LEARNING_RATE
+
+    def finish(self, agent: Agent) -> None:
+        """After the last update."""
+        agent.end_warm_start()
