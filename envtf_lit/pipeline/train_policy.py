@@ -10,7 +10,7 @@ from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.agents.store import publish_policy
 from envtf_lit.data.datamodules import TransitionData
-from envtf_lit.data.loaders import UPDATES_PER_STEP
+from envtf_lit.data.options import UPDATES_PER_STEP
 from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.dataset import dataset_of
