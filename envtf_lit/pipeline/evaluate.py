@@ -91,11 +91,13 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
         for policy, options in params.train_policy.items():
             imagined_in = None if options.world_model == NO_WORLD_MODEL else options.world_model
             metrics["policies"][policy] |= {"algorithm": algorithm_of(options), "world_model": imagined_in}
+            metrics["policies"][policy]["effective_episodes"] = _last(curves[policy], EFFECTIVE)
         write_json(root / METRICS, metrics)
     return metrics
 
 
 MOST_CURVES = 16 << 20  # bytes
+EFFECTIVE = "train/effective_episodes"  # a column of a policy's curves
 
 
 def _labels(params: Params) -> dict[str, str]:
@@ -103,6 +105,12 @@ def _labels(params: Params) -> dict[str, str]:
     labels = {name: ALGORITHMS[algorithm_of(options)].label for name, options in params.train_policy.items()}
     found = list(labels.values())
     return {name: label if found.count(label) == 1 else f"{label}: {name}" for name, label in labels.items()}
+
+
+def _last(curves: pd.DataFrame, column: str) -> float | None:
+    """A column's last number; None where there is none, as in curves of an earlier version."""
+    logged = curves[column].dropna() if column in curves else ()
+    return float(logged.iloc[-1]) if len(logged) else None
 
 
 def _curves(folder: Path) -> pd.DataFrame:
