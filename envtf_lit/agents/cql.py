@@ -28,11 +28,8 @@ class ConservativeOptions(PolicyOptions):
             that differ by far less count alike, and the term pushes their mean down. Published is 1 in plain rewards:
             1 / scale here, with which little but the best of the proposals counts.
         sampled_actions: actions of each kind (uniform, pi(s), pi(s')) in the log-sum-exp.
-        clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log; of
-            the mean over action dimensions. Ours: published is 0.
     """
 
-    clone_weight: NonNegative = 0.75
     cql_weight: NonNegative = 0.1
     cql_temperature: Positive = rare(1.0)
     sampled_actions: Count = rare(2)
@@ -40,7 +37,14 @@ class ConservativeOptions(PolicyOptions):
 
 @dataclass(frozen=True)
 class CQLOptions(ConservativeOptions, SACOptions):
-    """Conservative Q-Learning has the options of its term, and soft actor-critic's."""
+    """Conservative Q-Learning has the options of its term, and soft actor-critic's.
+
+    Attributes:
+        clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log; of
+            the mean over action dimensions. Ours: published is 0.
+    """
+
+    clone_weight: NonNegative = 0.75
 
 
 class CQL(SAC):
