@@ -28,6 +28,8 @@ autodoc_default_options = {"members": True}
 autodoc_inherit_docstrings = False  # Lightning's are not ours
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
+python_maximum_signature_line_length = 88
+napoleon_attr_annotations = False  # types stand in the signature
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 
@@ -35,6 +37,7 @@ html_theme = "furo"
 html_title = "envtf_lit"
 html_show_sphinx = False
 html_theme_options = {"top_of_page_buttons": []}
+html_favicon = "_static/favicon.svg"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 mathjax_path = "mathjax/tex-chtml.js"
