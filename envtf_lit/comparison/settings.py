@@ -16,7 +16,7 @@ from envtf_lit.pipeline.yaml import dump_params, preset_params
 
 CLONE = "clone"  # the section of the policy that acts in the first rollouts
 PAPER_MODEL = "paper"  # the section of the paper's own world model, and its preset
-LATEST = 3  # a phase at the end that is counted in updates takes at most one in so many of them
+LATEST = 3  # each phase at the end that is counted in updates takes at most one in so many of all
 
 
 @cache
@@ -28,7 +28,7 @@ def policy_options(cell: Cell) -> PolicyOptions:
     """The policy's options: of its kit, fitted to the budget.
 
     What was published as a number of updates before the algorithm's own, such as RAMBO's cloning, keeps its share of
-    them; what comes last keeps its number, as far as a third of the budget holds it.
+    them; the phases that end `et_cql` keep their numbers, as far as a third of the budget holds each.
 
     Raises:
         UserError: nothing was published for the task.
@@ -44,9 +44,11 @@ def policy_options(cell: Cell) -> PolicyOptions:
     }
     if options.warm_start >= 1.0:
         values["warm_start"] = options.warm_start / options.updates
-    if values.get("value_gradient"):
-        last = values["value_gradient"]
-        values["value_gradient"] = last | {"updates": min(last["updates"], max(1, budget.updates // LATEST))}
+    most = max(1, budget.updates // LATEST)
+    if "critic_updates" in values:
+        values["critic_updates"] = min(values["critic_updates"], most)
+    if "value_gradient" in values:
+        values["value_gradient"] |= {"updates": min(values["value_gradient"]["updates"], most)}
     if values["world_model"] != NO_WORLD_MODEL and cell.algorithm == "et_cql_paper" and budget.paper_model:
         paper = _preset(PAPER_MODEL).generate_rollouts
         values["world_model"] = PAPER_MODEL
