@@ -13,7 +13,7 @@ from envtf_lit.evaluation.horizon import horizon_report
 from envtf_lit.evaluation.metrics import collect_metrics, collect_offline_metrics, world_model_metrics
 from envtf_lit.evaluation.offline import evaluate_offline
 from envtf_lit.figures import gallery
-from envtf_lit.figures.video import no_video, real_vs_imagined
+from envtf_lit.figures.video import ghost_over_real, no_video, real_vs_imagined
 from envtf_lit.files import check_plain, replacing, write_json
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.dataset import dataset_of
@@ -88,6 +88,7 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
                 gallery.draw_scores(dataset, source, robot, returns, _labels(params), plots)
                 episode, gif = list(returns.values())[-1].median, video / "real_vs_imagined.gif"
                 real_vs_imagined(model, episode, robot, scale, gif, frames=options.video_frames)
+                ghost_over_real(model, episode, robot, scale, video / "ghost.gif", frames=options.video_frames)
         for policy, options in params.train_policy.items():
             imagined_in = None if options.world_model == NO_WORLD_MODEL else options.world_model
             metrics["policies"][policy] |= {"algorithm": algorithm_of(options), "world_model": imagined_in}
