@@ -181,7 +181,7 @@ def _captioned(picture: np.ndarray, note: str, colour: str) -> Image.Image:
     height, width, _ = picture.shape
     page = Image.new("RGB", (width, height + 2 * HEADER), "white")
     page.paste(Image.fromarray(picture), (0, HEADER))
-    pen, middle = ImageDraw.Draw(page), {"anchor": "mm", "font": ImageFont.load_default(14)}
+    pen, middle = ImageDraw.Draw(page), {"anchor": "mm", "font": ImageFont.load_default(12)}
     pen.text((width / 2, HEADER / 2), "real, and as a ghost what is imagined", fill="black", **middle)
     pen.text((width / 2, height + 1.5 * HEADER), note, fill=colour, **middle)
     return page
