@@ -2,6 +2,7 @@
 #
 #   make repro PRESET=tiny      the whole pipeline in a temporary copy, in minutes
 #   make docs                   the site, built offline: reports/site/index.html
+#   make tutorials              the notebooks, executed: reports/notebooks/*.html
 #   make bench D3RLPY=PYTHON     speed of agents and model; a Python that has d3rlpy gives the ratios with it
 #   make … TORCH_INDEX=URL      another build of torch, such as https://download.pytorch.org/whl/cpu
 #   make … CONSTRAINTS=FILE     other pinned versions (CONSTRAINTS= for the newest that pyproject.toml allows)
@@ -27,10 +28,10 @@ PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check
 PINNED = $(PIP) $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) $(if $(LOCK),--no-build-isolation)
 TORCH = $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: help repro test test-all docs bench lint lock clean
+.PHONY: help repro tutorials test test-all docs bench lint lock clean
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -8
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -9
 
 repro: .venv/.installed .dvc/tmp/.ready
 ifeq ($(PRESET),)
@@ -42,6 +43,11 @@ else
 	  cd "$$copy"; dvc repro; \
 	  echo "Done: $$copy/reports/report.html (the copy is yours to keep or delete)"
 endif
+
+# Those whose notebook or package did not change since are not executed again.
+tutorials: .venv/.installed .dvc/tmp/.ready
+	dvc repro notebooks/dvc.yaml
+	@echo "Done: reports/notebooks"
 
 test: .venv/.installed-dev
 	pytest -q -n auto

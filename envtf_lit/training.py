@@ -8,6 +8,7 @@ import json
 import logging
 import platform
 import shutil
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -161,7 +162,10 @@ def trained(
         limit_val_batches=None if validate else 0,
         gradient_clip_val=gradient_clip,
     )
-    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    with warnings.catch_warnings():
+        # Lightning's use of an older torch's name helps nobody, least of all in a notebook
+        warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
+        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
     if monitor is not None:

@@ -30,6 +30,7 @@ EXTRAS = PROJECT["optional-dependencies"]
 NEED = {
     "envtf_lit/data/sources/parquet.py": "parquet",
     "envtf_lit/export.py": "export",
+    "envtf_lit/figures/inline.py": "pipeline",
     "envtf_lit/figures/notebook.py": "pipeline",
     "envtf_lit/figures/report.py": "pipeline",
     "envtf_lit/zoo/train.py": "behaviour",

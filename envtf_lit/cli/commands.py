@@ -39,6 +39,7 @@ COMMANDS = {
         "project", "Write a new project: dvc.yaml, params.yaml, notebooks", "The same command writes what is missing."
     ),
     "params": Command("project", "Print a complete params.yaml"),
+    "tutorial": Command("project", "Execute a tutorial notebook: reports/notebooks/NAME.html"),
     "data check": Command("data", "Print what a dataset holds and every problem in it, each with a fix"),
     "data convert": Command("data", "Write a dataset in another format, and say what was changed or left behind"),
     "zoo list": Command("zoo", "Print the twenty datasets and the policies behind each"),

@@ -1,12 +1,16 @@
-"""`envtf init`, `envtf params` and `envtf doctor`: what helps around the pipeline."""
+"""`envtf init`, `envtf params`, `envtf tutorial` and `envtf doctor`: what helps around the pipeline."""
 
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
 
 from envtf_lit.cli.output import console
 from envtf_lit.cli.signatures import Folder, run_command
 from envtf_lit.errors import UserError
+
+Tutorial = Annotated[str, "NAME"]
 
 
 def init(folder: Folder, /, *, preset: str = "small") -> None:
@@ -42,6 +46,29 @@ def params(*, preset: str = "small", algorithm: str | None = None, task: str | N
     sys.stdout.write(params_yaml(found))
 
 
+def tutorial(
+    name: Tutorial,
+    /,
+    *,
+    notebooks: Folder = Path("notebooks"),
+    out: Folder = Path("reports/notebooks"),
+    tiny: bool = False,
+    quiet: bool = False,
+) -> None:
+    """Executes a tutorial notebook.
+
+    Args:
+        name: such as 01_data.
+        notebooks: folder of the tutorials.
+        out: folder of the executed notebook and its HTML.
+        tiny: in seconds: shows that it works, not that its result is good.
+        quiet: without a progress bar.
+    """
+    from envtf_lit.project.tutorials import run_tutorial
+
+    console().print(f"Wrote {run_tutorial(name, notebooks, out=out, tiny=tiny, progress=not quiet)}")
+
+
 def doctor() -> None:
     """Prints what a bug report needs to know of this machine."""
     from envtf_lit.project.doctor import report
@@ -50,9 +77,9 @@ def doctor() -> None:
         console().print(f"{name:<16} {value}")
 
 
-FUNCTIONS = {"init": init, "params": params, "doctor": doctor}
+FUNCTIONS = {"init": init, "params": params, "tutorial": tutorial, "doctor": doctor}
 
 
 def run(name: str, words: Sequence[str]) -> None:
-    """Runs `envtf init`, `envtf params` or `envtf doctor`."""
+    """Runs `envtf init`, `envtf params`, `envtf tutorial` or `envtf doctor`."""
     run_command(FUNCTIONS[name], name, words)

@@ -17,15 +17,18 @@ from papermill.exceptions import PapermillExecutionError
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import replacing
 
-# JupyterLab's page with the code folded away, and without the scripts that it would fetch: MathJax, Mermaid, RequireJS
-FOLDED = """
+# JupyterLab's page without the scripts that it would fetch: MathJax, Mermaid, RequireJS
+OFFLINE = """
 {%- extends 'lab/index.html.j2' -%}
 {%- block html_head_js -%}{%- endblock html_head_js -%}
 {%- block html_head_js_mathjax -%}{%- endblock html_head_js_mathjax -%}
 {%- block html_head_js_mermaidjs -%}{%- endblock html_head_js_mermaidjs -%}
-{%- block input_group -%}
-<details style="margin-left: 64px; color: gray"><summary>code</summary>{{ super() }}</details>
-{%- endblock input_group -%}
+"""
+# the same with the code folded away
+FOLDED = f"""{OFFLINE}
+{{%- block input_group -%}}
+<details style="margin-left: 64px; color: gray"><summary>code</summary>{{{{ super() }}}}</details>
+{{%- endblock input_group -%}}
 """
 KERNEL = {"name": "python3", "display_name": "Python 3", "language": "python"}
 
@@ -41,7 +44,13 @@ class OwnKernel(AsyncKernelManager):
 
 
 def execute(
-    notebook: Path, output: Path, parameters: Mapping[str, Any], *, cwd: Path | str = ".", progress: bool = False
+    notebook: Path,
+    output: Path,
+    parameters: Mapping[str, Any],
+    *,
+    cwd: Path | str = ".",
+    folded: bool = True,
+    progress: bool = False,
 ) -> Path:
     """Runs a notebook in this Python's own kernel and writes it with its outputs, as notebook and as HTML.
 
@@ -53,6 +62,7 @@ def execute(
         output: the executed `.ipynb` to write; the HTML goes beside it.
         parameters: values for names in the parameters cell.
         cwd: the folder to run in.
+        folded: the HTML hides the code until it is asked for, as a report's; a tutorial's is there to be read.
         progress: whether to show a bar.
 
     Returns:
@@ -85,7 +95,7 @@ def execute(
     page = output.with_suffix(".html")
     with replacing(output) as temporary, replacing(page) as html:
         temporary.write_text(nbformat.writes(executed), encoding="utf-8")
-        html.write_text(_to_html(executed, notebook.stem), encoding="utf-8")
+        html.write_text(_to_html(executed, notebook.stem, FOLDED if folded else OFFLINE), encoding="utf-8")
     return page
 
 
@@ -114,7 +124,7 @@ def _forget_the_run(executed: nbformat.NotebookNode) -> None:
         cell.metadata.pop("execution", None)
 
 
-def _to_html(executed: nbformat.NotebookNode, title: str) -> str:
-    exporter = HTMLExporter(template_file="folded.html.j2", extra_loaders=[DictLoader({"folded.html.j2": FOLDED})])
+def _to_html(executed: nbformat.NotebookNode, title: str, template: str) -> str:
+    exporter = HTMLExporter(template_file="page.html.j2", extra_loaders=[DictLoader({"page.html.j2": template})])
     html, _ = exporter.from_notebook_node(executed, resources={"metadata": {"name": title}})
     return html

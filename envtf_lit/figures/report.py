@@ -1,16 +1,15 @@
 """One run of the pipeline, as the report notebooks read and show it."""
 
-import base64
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from IPython.display import HTML, Markdown, display
 
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.comparison import Comparison, compare
+from envtf_lit.figures.inline import show_picture
 from envtf_lit.files import read_json
 
 MARKS = ("dvc.yaml", "params.yaml", "reports/metrics.json")  # a folder with one of these is a project
@@ -120,11 +119,11 @@ class Run:
 
     def plot(self, name: str) -> None:
         """Displays a plot of the evaluate stage."""
-        _show_picture(self.root / f"reports/plots/{name}.png", name.replace("_", " "))
+        show_picture(self.root / f"reports/plots/{name}.png", name.replace("_", " "))
 
     def video(self) -> None:
         """Displays the video of the evaluate stage."""
-        _show_picture(self.root / "reports/video/real_vs_imagined.gif", "real and imagined robot, side by side")
+        show_picture(self.root / "reports/video/real_vs_imagined.gif", "real and imagined robot, side by side")
 
 
 def read_run(root: str | Path, *, simulator: bool) -> Run:
@@ -170,19 +169,3 @@ def project_root(start: str | Path) -> Path:
 def _agree(run: Run, policy: str) -> bool:
     episodes = run.episodes[policy]  # written with six digits
     return abs(episodes.mean() - run.mean(policy)) <= 1e-5 * max(1.0, abs(episodes).max())
-
-
-def say(*sentences: str) -> None:
-    """Displays sentences as one paragraph; empty ones are left out."""
-    display(Markdown(" ".join(sentence for sentence in sentences if sentence)))
-
-
-def show(table: pd.DataFrame) -> None:
-    """Displays a table of text, without row numbers."""
-    display(HTML(table.to_html(index=False, border=0)))
-
-
-def _show_picture(path: Path, text: str) -> None:
-    """As HTML, for nbconvert shows no GIF otherwise, and gives no picture a text for those who cannot see it."""
-    content = base64.b64encode(path.read_bytes()).decode()
-    display(HTML(f'<img alt="{text}" src="data:image/{path.suffix[1:]};base64,{content}">'))

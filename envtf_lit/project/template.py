@@ -23,7 +23,7 @@ def template_folder() -> Path:
 
 
 def write_project(folder: Path, preset: str) -> list[str]:
-    """Writes dvc.yaml, params.yaml of that preset, notebooks, and DVC's settings into `folder`.
+    """Writes dvc.yaml, params.yaml of that preset, the report's notebooks, and DVC's settings into `folder`.
 
     Nothing that lies there is changed. Settings of git and DVC that are there already stay in force.
 
@@ -39,7 +39,7 @@ def write_project(folder: Path, preset: str) -> list[str]:
             f"{folder}/dvc.yaml exists already: choose another folder, or `envtf params` for a params.yaml."
         )
     source = template_folder()
-    files = {f"notebooks/{path.name}": path.read_text("utf-8") for path in (source / "notebooks").glob("[!.]*")}
+    files = {f"notebooks/{path.name}": path.read_text("utf-8") for path in (source / "notebooks").glob("report*.ipynb")}
     files["params.yaml"] = params
     settings = {name: (source / name).read_text("utf-8") for name in PLAIN_FILES} | _dvc_settings(folder)
     kept = [name for name in settings if (folder / name).is_file()]
