@@ -13,7 +13,12 @@ from PIL import Image
 from envtf_lit.data.cards import dataset_card
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.horizon import horizon_report
-from envtf_lit.evaluation.metrics import collect_metrics, collect_offline_metrics, world_model_metrics
+from envtf_lit.evaluation.metrics import (
+    collect_metrics,
+    collect_offline_metrics,
+    held_out_metrics,
+    world_model_metrics,
+)
 from envtf_lit.evaluation.offline import OfflineEstimate, OfflineEstimates
 from envtf_lit.figures import gallery
 from envtf_lit.figures.video import no_video, write_gif
@@ -63,7 +68,16 @@ def some_estimates() -> OfflineEstimates:
     """Three held-out episodes, on which the model errs by 10."""
     recorded = np.array([300.0, 310.0, 320.0])
     policies = {name: OfflineEstimate(level + np.arange(3.0), 0.5) for name, level in LEVELS.items()}
-    return OfflineEstimates(recorded=recorded, imagined=recorded + 10.0, policies=policies)
+    lengths = np.array([40, 50, 45])
+    return OfflineEstimates(recorded=recorded, imagined=recorded + 10.0, lengths=lengths, policies=policies)
+
+
+def some_frontier(kept: int = 2) -> pd.DataFrame:
+    """The clone and two actors further out, of which one is published; the last strays from what the model knows."""
+    columns = ("update", "excess", "promise", "error", "lost", "steps")
+    rows = [(0, 0.0, 310.0, 2.0, 0.001, 45.0), (200, 0.05, 350.0, 3.0, 0.002, 45.0), (400, 0.2, 420.0, 5.0, 0.03, 90.0)]
+    table = pd.DataFrame(rows, columns=columns)
+    return table.assign(kept=[int(place == kept) for place in range(3)])
 
 
 def made_up_run(root: Path, source: str = "file", *, simulator: bool = True) -> Path:
@@ -84,10 +98,16 @@ def made_up_run(root: Path, source: str = "file", *, simulator: bool = True) -> 
     metrics = _simulated(root, data, source, facts) if simulator else _estimated(root, facts)
     for name, learned in LEARNED.items():
         metrics["policies"][name] |= learned
+    if simulator:
+        metrics["policies"]["dreamer"] |= {"clone_return_mean": 280.0}
+    measured = {"dreamer": 201.0, "dreamer/clone": 280.0} if simulator else {}
+    gallery.draw_frontiers({"dreamer": some_frontier()}, metrics["held_out"], data, source, LABELS, measured, plots)
     tables = {"world_model/small": model_curves} | {f"policy/{name}": table for name, table in curves.items()}
     for name, table in tables.items():
         (root / "models" / name).mkdir(parents=True)
         table.to_csv(root / "models" / name / "curves.csv", index=False)
+    some_frontier().to_csv(root / "models/policy/dreamer/frontier.csv", index=False)
+    write_json(root / "models/policy/dreamer/resolved.json", {"options": {"trust": "default"}})
     found = {"termination_recall": 0.5, "termination_false_alarms": 0.01}
     write_json(root / "models/world_model/small/metrics.json", found)
     write_json(root / "reports/metrics.json", metrics)
@@ -99,6 +119,7 @@ def _simulated(root: Path, data: OfflineDataset, source: str, facts: dict[str, A
     returns = {name: some_returns(level) for name, level in LEVELS.items()}
     gallery.draw_scores(data, source, HOPPER, returns, LABELS, root / "reports/plots")
     write_gif([Image.new("RGB", (8, 8))], root / "reports/video/real_vs_imagined.gif")
+    facts |= {"held_out": held_out_metrics(some_estimates())}
     return collect_metrics(returns, task="hopper-medium-replay", source=source, robot=HOPPER, **facts)
 
 

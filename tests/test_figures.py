@@ -13,13 +13,14 @@ import pandas as pd
 import pytest
 import torch
 from analytic import linear_data, linear_world
-from made_up_runs import some_estimates, some_returns, some_rollouts
+from made_up_runs import some_estimates, some_frontier, some_returns, some_rollouts
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
 from envtf_lit.evaluation.horizon import horizon_report
+from envtf_lit.evaluation.metrics import held_out_metrics
 from envtf_lit.figures import gallery, learning, scores
 from envtf_lit.figures.style import COLOURS, drawing, featured, model_looks, observation_labels
 from envtf_lit.robots.tasks import ROBOTS
@@ -39,7 +40,7 @@ POLICY_CURVES = pd.DataFrame({"step": [0, 1, 2], "train/q_data": [1.0, 2.0, 3.0]
 CLONE_CURVES = pd.DataFrame({"step": [0, 1, 2], "train/clone_loss": [3.0, 2.0, 1.0]})
 PLOTS = (
     "dataset_returns", "world_model_curves", "horizon", "one_step", "calibration", "traces", "rollout_uncertainty",
-    "scores", "policy_curves",
+    "scores", "policy_curves", "frontier",
 )  # fmt: skip
 
 
@@ -55,6 +56,8 @@ def draw_all(folder: Path) -> Path:
     gallery.draw_scores(data, "minari", HOPPER, returns, labels, folder)
     curves = {"bc": CLONE_CURVES, "cql": POLICY_CURVES, "et_cql": POLICY_CURVES + 1}
     gallery.draw_policy_curves(curves, labels, folder)
+    held_out = held_out_metrics(some_estimates())
+    gallery.draw_frontiers({"et_cql": some_frontier()}, held_out, data, "zoo", labels, {}, folder)
     return folder
 
 

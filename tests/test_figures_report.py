@@ -193,7 +193,8 @@ def test_the_report_has_the_same_bytes_every_time_and_needs_no_network(lost: Run
     assert re.findall(r"<script|<link|@import|url\(['\"]?http|src=\"(?!data:)", html) == []
     assert str(lost.root) not in html
     assert "ET + CQL scores **6.8**" in text and "A note." in text
-    assert html.count('src="data:image/png') == 9 and html.count('src="data:image/gif') == 1
+    assert "promised **390 to 450**" in text
+    assert html.count('src="data:image/png') == 10 and html.count('src="data:image/gif') == 1
     assert "No description" not in html
 
 
@@ -205,7 +206,10 @@ def test_the_report_without_a_simulator(offline: Run):
     text = said(output)
     assert "No video" in text and "a classifier learned from the log says so" in text
     assert "D4RL" not in text and "score" not in text
-    assert page.read_text().count('src="data:image/png') == 9
+    first, rest = text.split("transitions in", 1)  # before a word is said of the data
+    assert "**Try first ET + CQL**" in first and "**ET + CQL acts beyond the log**" in first
+    assert "promised **390 to 450**" in rest
+    assert page.read_text().count('src="data:image/png') == 10
 
 
 # what it suggests to try

@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.agents import trust as trust_module
 from envtf_lit.agents.et_cql import ETCQL, ETCQLOptions, GuardedRolloutOptions
-from envtf_lit.agents.frontier import LEAST_GAIN, Frontier
-from envtf_lit.agents.trust import LEVELS, Trust
+from envtf_lit.agents.frontier import Frontier
+from envtf_lit.agents.levels import LEAST_GAIN, LEVELS
+from envtf_lit.agents.trust import Trust
 from envtf_lit.agents.value_gradient import ImaginedPaths, ValueGradientOptions
 from envtf_lit.data.loaders import DrawnRows
 from envtf_lit.imagination import promise as promise_module
@@ -141,7 +142,7 @@ def test_a_promise_is_the_mean_return_of_whole_imagined_episodes():
         returns.append(total)
     assert abs(found.mean - sum(returns) / 2) < 4 * found.error
     assert found.error == pytest.approx(abs(returns[0] - returns[1]) / 2 / math.sqrt(300), rel=0.05)
-    assert found.lost == 0.0
+    assert found.lost == 0.0 and found.steps == 40.0
 
 
 def test_promises_end_with_the_fall_and_count_no_more_than_was_ever_paid():
@@ -150,7 +151,7 @@ def test_promises_end_with_the_fall_and_count_no_more_than_was_ever_paid():
     imagined.reward_range = -1.0, 0.0
     found = promised(imagined, Still(), episodes=50, generator=torch.Generator().manual_seed(0))
     assert -1.0 <= found.mean <= 0.0
-    assert 0.0 < found.lost < 1.0  # steps that were promised more
+    assert 0.0 < found.lost < 1.0 and found.steps == 1.0  # steps that were promised more
 
 
 def test_episodes_that_fell_say_nothing_about_a_time_limit(monkeypatch):
@@ -185,7 +186,7 @@ def test_the_log_is_left_for_a_clear_gain_alone(promises, errors, price, kept):
     actors = [make_actor(seed) for seed in range(3)]
     frontier = Frontier(actors[0], 4)
     for place, (mean, error) in enumerate(zip(promises, errors, strict=True)):
-        promise = Promise(mean, error, 0.01)
+        promise = Promise(mean, error, lost=0.01, steps=9.0)
         frontier.add(actors[place], update=place, excess=0.1 * place, promise=promise)
     chosen = frontier.choose(price)
     assert torch.equal(flat(chosen.state_dict()), flat(actors[kept].state_dict()))
@@ -234,6 +235,8 @@ def test_a_whole_training_publishes_what_its_trust_allows(level):
     kept = next(place for place, row in enumerate(rows) if row["kept"])
     assert torch.equal(flat(agent.average_actor.state_dict()), flat(agent.frontier.actors[kept].state_dict()))
     assert rows[-1]["excess"] < LEVELS[level].slack + 0.3
+    (clone,) = agent.companions().values()
+    assert torch.equal(flat(clone.state_dict()), flat(agent.frontier.actors[0].state_dict()))
 
 
 def test_an_unknown_level_of_trust_is_refused():

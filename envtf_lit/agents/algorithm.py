@@ -166,3 +166,7 @@ class Algorithm(L.LightningModule, ABC):
     def records(self) -> dict[str, list[dict[str, Any]]]:
         """Tables to publish beside the policy, by name; each row's columns are alike."""
         return {}
+
+    def companions(self) -> dict[str, Actor]:
+        """Further actors to publish in the policy's folder, each in a folder of its name there."""
+        return {}

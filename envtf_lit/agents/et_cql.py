@@ -6,13 +6,15 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
+from envtf_lit.actors import Actor
 from envtf_lit.agents.actor_critic import ActorCritic
 from envtf_lit.agents.combo import COMBO, ImaginingOptions, MixingOptions
 from envtf_lit.agents.cql import CQL, ConservativeOptions
 from envtf_lit.agents.frontier import Frontier
+from envtf_lit.agents.levels import CLONE, FRONTIER, LEVELS, TrustLevel
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.phases import Batch, Logs, Losses, Part, Phase
-from envtf_lit.agents.trust import LEVELS, Trust, TrustLevel, WatchedWarmStart
+from envtf_lit.agents.trust import Trust, WatchedWarmStart
 from envtf_lit.agents.value_gradient import BETAS, PLACES, ValueGradient, ValueGradientOptions
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.errors import UserError
@@ -64,7 +66,7 @@ class ETCQLOptions(MixingOptions, ConservativeOptions):
 
     Attributes:
         trust: how far the policy may leave what the log supports: `cautious`, `default`, or `bold`, which is for those
-            who can try it in a simulator (`trust.LEVELS`).
+            who can try it in a simulator (`levels.LEVELS`).
         critic_updates: before the value gradient, in which critics learn the clone's value on real rows and on those of
             `generate_rollouts`. All updates before are the warm start, whatever the common `warm_start` says.
         value_gradient: the end of the training, in which the actor follows the gradient through the world model.
@@ -158,4 +160,8 @@ class ETCQL(COMBO):
 
     def records(self) -> dict[str, list[dict[str, Any]]]:
         """The frontier, as `frontier.csv`."""
-        return {"frontier": self.frontier.rows()}
+        return {FRONTIER: self.frontier.rows()}
+
+    def companions(self) -> dict[str, Actor]:
+        """The clone, which the frontier's distances are measured from: what the log supports, to be tried first."""
+        return {CLONE: self.trust.clone}

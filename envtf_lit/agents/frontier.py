@@ -8,10 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit.actors import Actor
+from envtf_lit.agents.levels import COLUMNS, LEAST_GAIN
 from envtf_lit.imagination.promise import Promise
-
-LEAST_GAIN = 0.05  # of what is promised of the clone: what less is promised for is not worth leaving the log
-COLUMNS = ("update", "excess", "promise", "error", "lost")
 
 
 class Frontier(nn.Module):
@@ -37,7 +35,7 @@ class Frontier(nn.Module):
         """A further actor, `excess` nats per action dimension less likely than the clone."""
         place = int(self.count)
         self.actors[place].load_state_dict(actor.state_dict())
-        row = (float(update), excess, promise.mean, promise.error, promise.lost)
+        row = (float(update), excess, promise.mean, promise.error, promise.lost, promise.steps)
         self.table[place] = torch.tensor(row, dtype=torch.float64)
         self.count += 1
 
@@ -47,7 +45,7 @@ class Frontier(nn.Module):
         `(promise - standard error) / |promise of the clone| - price * excess`, the excess in nats. All are promised in
         the same model, whose errors they share: what counts is the difference.
         """
-        _, excess, promise, error, _ = self.table[: int(self.count)].unbind(1)
+        _, excess, promise, error, *_ = self.table[: int(self.count)].unbind(1)
         worth = (promise - error - promise[0]) / promise[0].abs().clamp(min=1e-9) - price * excess.clamp(min=0.0)
         worth[0] = LEAST_GAIN
         self.kept.fill_(worth.argmax())

@@ -17,6 +17,7 @@ def publish_policy(
     kept: Mapping[str, float],
     settings: dict[str, Any],
     records: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
+    companions: Mapping[str, Actor] | None = None,
 ) -> dict[str, Any]:
     """Writes a policy's folder.
 
@@ -27,6 +28,7 @@ def publish_policy(
         kept: the row of them that belongs to the actor.
         settings: the resolved options.
         records: further tables (`Algorithm.records`), each written as `NAME.csv`.
+        companions: further actors (`Algorithm.companions`), each in a folder of its name.
 
     Returns:
         The row, its columns named without their split.
@@ -37,4 +39,6 @@ def publish_policy(
         record_training(folder, metrics, settings, curves)
         for name, rows in (records or {}).items():
             write_table(folder / f"{name}.csv", rows)
+        for name, companion in (companions or {}).items():
+            save_policy(folder / name, companion)
     return metrics

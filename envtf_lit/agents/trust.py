@@ -2,8 +2,6 @@
 
 import copy
 import math
-from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -19,25 +17,6 @@ CHECKED = 8_192  # rows of each look
 ROWS = 512  # likewise, at each update of the dual variable
 FIRST, LEAST, MOST = 0.05, 1e-3, 100.0  # the dual variable at the start, and between which it stays
 RATE = 0.3  # of its logarithm's ascent, per nat
-
-
-@dataclass(frozen=True)
-class Level:
-    """A level of trust.
-
-    Attributes:
-        slack: nats per action dimension that an actor may be less likely than the clone, at the end.
-        price: what must be promised for each nat of distance, in multiples of what is promised of the clone.
-        believes: rewards above any recorded one are taken as the model says; else a path ends where it promises one.
-    """
-
-    slack: float
-    price: float
-    believes: bool = False
-
-
-LEVELS = {"cautious": Level(0.1, 2.0), "default": Level(0.3, 1.0), "bold": Level(0.6, 0.0, believes=True)}
-TrustLevel = Literal["cautious", "default", "bold"]
 
 
 class Trust(nn.Module):

@@ -63,6 +63,11 @@ COMMANDS = {
         "Measure what world models know of their own errors: coverage, detection of new data, errors of rollouts",
         _KEPT,
     ),
+    "narrow": Command(
+        "studies",
+        "Measure whether policies from logs of machines that were held back do harm, in the true simulator",
+        _KEPT,
+    ),
     "bench model": Command("studies", "Imagination and training, against ensemble, simulator and matrix product"),
     "bench agents": Command("studies", "The agents' updates on a CPU, against d3rlpy, and without Lightning"),
     "bench cost": Command("studies", "Training to equal held-out error: transformer, ensemble, plain network", _KEPT),

@@ -1,7 +1,7 @@
-"""The measurements: of horizons, calibration, hidden dynamics, speed and cost."""
+"""The measurements: of horizons, calibration, hidden dynamics, harm from narrow logs, speed and cost."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,6 +16,9 @@ Models = Annotated[tuple[str, ...], "NAME=FOLDER"]
 Device = Annotated[str, "NAME"]
 Program = Annotated[Path, "PYTHON"]
 
+Log = Literal["governed", "plain", "clock", "expert", "walker2d"]  # written out, as robots are
+
+LOGS: tuple[Log, ...] = ("governed", "plain", "clock", "expert", "walker2d")
 ROBOTS: tuple[Robot, ...] = ("hopper", "halfcheetah", "walker2d", "ant")
 
 
@@ -144,6 +147,47 @@ def calibrate(
     run_study(CalibrationStudy(), out, robots=robots, tier=tier, others=others, **training.comparison())
 
 
+def narrow(
+    *,
+    out: File,
+    logs: tuple[Log, ...] = LOGS,
+    seeds: Positive = 5,
+    episodes: Positive = 10,
+    trust: Literal["cautious", "default", "bold"] = "default",
+    preset: Literal["tiny", "small", "base"] = "small",
+    work: Folder = Path(".envtf/narrow"),
+    threads: Positive = CORES,
+    quiet: bool = False,
+) -> None:
+    """Measures whether policies from logs of machines that were held back do harm.
+
+    Args:
+        out: JSON; a table lies beside it.
+        logs: which of the five.
+        seeds: of training, on each log.
+        episodes: of each policy in the log's true simulator.
+        trust: how far policies may leave the log.
+        preset: sizes and budgets.
+        work: where logs and models lie.
+        threads: CPU threads.
+        quiet: no progress bars.
+    """
+    from envtf_lit.pipeline.yaml import preset_params
+    from envtf_lit.studies.narrow import NarrowOptions, run_narrow
+    from envtf_lit.studies.narrow_logs import MACHINES
+
+    run_narrow(
+        out,
+        params=replace(preset_params(preset), threads=threads),
+        machines={name: MACHINES[name] for name in logs},
+        trust=trust,
+        options=NarrowOptions(seeds=seeds, episodes=episodes),
+        work=work,
+        progress=not quiet,
+        report=console().print,
+    )
+
+
 def _named_folders(texts: Sequence[str]) -> dict[str, str]:
     """What the flags `--model` say."""
     found = dict[str, str]()
@@ -244,6 +288,7 @@ FUNCTIONS = {
     "hidden": hidden,
     "horizon": horizon,
     "calibrate": calibrate,
+    "narrow": narrow,
     "bench model": bench_model,
     "bench agents": bench_agents,
     "bench cost": bench_cost,

@@ -70,7 +70,7 @@ def collect_metrics(
         source: of the dataset, as in `DownloadOptions`; there are no scores where it is Minari.
         robot: gives the scores their scale.
         labels: what to call each policy.
-        facts: what else stands there: `world_model` and `rollouts`.
+        facts: what else stands there: `world_model`, `rollouts` and `held_out`.
     """
     unit, recorded, episodes = comparable(dataset, returns, robot, source)
     policies = {
@@ -110,13 +110,6 @@ def collect_offline_metrics(
         | {"action_error": estimate.action_error}
         for name, estimate in estimates.policies.items()
     }
-    error = np.sqrt(np.square(estimates.imagined - estimates.recorded).mean())
-    held_out = {
-        "episodes": len(estimates.recorded),
-        "return_mean": float(estimates.recorded.mean()),
-        "imagined_return_mean": float(estimates.imagined.mean()),
-        "imagined_return_error": float(error),
-    }
     returns = dataset.episode_returns
     known = {"return_mean": float(returns.mean()), "return_max": float(returns.max())}
     return {
@@ -124,6 +117,18 @@ def collect_offline_metrics(
         "seed": seed,
         "dataset": _size(dataset) | known,
         **facts,
-        "held_out": held_out,
+        "held_out": held_out_metrics(estimates),
         "policies": policies,
+    }
+
+
+def held_out_metrics(estimates: OfflineEstimates) -> dict[str, float]:
+    """What the model makes of recorded actions, beside what they earned: `held_out` in `reports/metrics.json`."""
+    error = np.sqrt(np.square(estimates.imagined - estimates.recorded).mean())
+    return {
+        "episodes": len(estimates.recorded),
+        "steps_mean": float(estimates.lengths.mean()),
+        "return_mean": float(estimates.recorded.mean()),
+        "imagined_return_mean": float(estimates.imagined.mean()),
+        "imagined_return_error": float(error),
     }

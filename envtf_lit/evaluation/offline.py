@@ -41,11 +41,13 @@ class OfflineEstimates:
     Attributes:
         recorded: (E,) float64, true returns of the held-out episodes.
         imagined: (E,) float64, returns that the model, on its own predictions, imagines of the recorded actions.
+        lengths: (E,) int64, their steps.
         policies: by name.
     """
 
     recorded: np.ndarray
     imagined: np.ndarray
+    lengths: np.ndarray
     policies: dict[str, OfflineEstimate]
 
 
@@ -65,6 +67,7 @@ def evaluate_offline(
     return OfflineEstimates(
         recorded=held_out.targets[..., -1].double().sum(1).cpu().numpy(),
         imagined=imagined.cpu().numpy(),
+        lengths=held_out.lengths.cpu().numpy(),
         policies={
             name: OfflineEstimate(
                 imagined_returns(model, policy, held_out, training), action_error(policy, held_out, training)

@@ -11,6 +11,7 @@ from envtf_lit.evaluation.horizon import HorizonReport
 from envtf_lit.evaluation.metrics import comparable
 from envtf_lit.evaluation.offline import OfflineEstimates
 from envtf_lit.figures import learning, model, scores
+from envtf_lit.figures.frontier import frontier_picture
 from envtf_lit.figures.style import write_table
 from envtf_lit.imagination.rollouts import Rollouts
 from envtf_lit.robots.returns import Returns
@@ -87,3 +88,35 @@ def draw_estimates(estimates: OfflineEstimates, labels: Mapping[str, str], folde
     returns = {name: estimate.returns for name, estimate in estimates.policies.items()}
     words = {"quantity": "return", "title": "Recorded and imagined return of every episode"}
     scores.score_strip(references, returns, folder / "scores.png", labels=labels, **words)
+
+
+def draw_frontiers(
+    frontiers: Mapping[str, pd.DataFrame],
+    held_out: Mapping[str, float],
+    dataset: OfflineDataset,
+    source: str,
+    labels: Mapping[str, str],
+    measured: Mapping[str, float],
+    folder: Path,
+) -> None:
+    """Draws `frontier`, where a policy has one.
+
+    Args:
+        frontiers: of the policies that have one, by name.
+        held_out: of the metrics: how the model errs on recorded actions.
+        dataset: its episodes that count are what promises are compared with.
+        source: of the dataset, as in `DownloadOptions`.
+        labels: what to call each policy.
+        measured: mean returns in the simulator, of policies by name and of their clones by `NAME/clone`.
+        folder: to write into.
+    """
+    if frontiers:
+        recorded = float(dataset.episode_returns[counted_episodes(dataset, source)].mean())
+        frontier_picture(
+            frontiers,
+            folder / "frontier.png",
+            held_out=held_out,
+            recorded=recorded,
+            policies=labels,
+            measured=measured,
+        )

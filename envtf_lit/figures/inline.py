@@ -23,8 +23,9 @@ def say(*sentences: str) -> None:
 
 
 def show(table: pd.DataFrame) -> None:
-    """Displays a table of text, without row numbers."""
-    display(HTML(table.to_html(index=False, border=0)))
+    """Displays a table of text, without row numbers; nothing of one without rows."""
+    if len(table):
+        display(HTML(table.to_html(index=False, border=0)))
 
 
 def show_source(thing: Any) -> None:

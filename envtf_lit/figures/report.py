@@ -1,6 +1,7 @@
 """One run of the pipeline, as the report notebooks read and show it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pandas as pd
 
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.comparison import Comparison, compare
+from envtf_lit.evaluation.promises import read_frontier
 from envtf_lit.figures.inline import show_picture
 from envtf_lit.files import read_json
 
@@ -104,6 +106,30 @@ class Run:
         decimal = self.measure == "score" or abs(value) >= 100
         return f"{value:{sign},.1f}" if decimal else f"{value:{sign}.3g}"
 
+    @cached_property
+    def frontiers(self) -> dict[str, pd.DataFrame]:
+        """What is known of the actors between log and policy, from the clone outward, of policies that say so."""
+        tables = {name: read_frontier(self.policy_folder(name)) for name in self.policies}
+        return {name: table for name, table in tables.items() if table is not None}
+
+    def trust(self, policy: str) -> str:
+        """The level of trust that a policy with a frontier was trained with."""
+        return read_json(self.policy_folder(policy) / "resolved.json")["options"]["trust"]
+
+    @property
+    def held_out(self) -> dict[str, float]:
+        """What recorded actions earned, and what the model makes of them."""
+        return self.metrics["held_out"]
+
+    @property
+    def recorded_return(self) -> float:
+        """Mean return of the recorded episodes."""
+        return self.card["returns"]["mean"]
+
+    def policy_folder(self, policy: str) -> Path:
+        """The folder of a policy."""
+        return self.root / "models/policy" / policy
+
     @property
     def world_model_folder(self) -> Path:
         """The folder of the world model that was scored."""
@@ -111,7 +137,7 @@ class Run:
 
     def policy_curves(self, policy: str) -> pd.DataFrame:
         """What a policy's training logged, a row per epoch."""
-        return pd.read_csv(self.root / f"models/policy/{policy}/curves.csv")
+        return pd.read_csv(self.policy_folder(policy) / "curves.csv")
 
     def table(self, name: str) -> pd.DataFrame:
         """The numbers behind a plot."""
@@ -120,6 +146,11 @@ class Run:
     def plot(self, name: str) -> None:
         """Displays a plot of the evaluate stage."""
         show_picture(self.root / f"reports/plots/{name}.png", name.replace("_", " "))
+
+    def plot_frontier(self) -> None:
+        """Displays the frontier of trust, where a policy has one."""
+        if self.frontiers:
+            self.plot("frontier")
 
     def video(self) -> None:
         """Displays the video of the evaluate stage."""

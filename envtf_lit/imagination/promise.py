@@ -21,11 +21,13 @@ class Promise:
         mean: over episodes.
         error: standard error of the mean; each episode runs in a world of its own, so that it holds the model's doubt.
         lost: share of the steps at which the model had left what it knows, or promised more than any recorded reward.
+        steps: mean length of the episodes.
     """
 
     mean: float
     error: float
     lost: float
+    steps: float
 
 
 @torch.no_grad()
@@ -67,4 +69,5 @@ def promised(imagination: Imagination, policy: Policy, *, episodes: int, generat
         ended[step.rows] = imagination.terminated(step.prediction.observation)
         beyond = lost(step.prediction, options.novelty_limit) | (reward > high)
         steps, strayed = steps + len(step.rows), strayed + int(beyond.sum())
-    return Promise(float(total.mean()), float(total.std()) / math.sqrt(episodes), strayed / max(1, steps))
+    error = float(total.std()) / math.sqrt(episodes)
+    return Promise(float(total.mean()), error, lost=strayed / max(1, steps), steps=steps / episodes)

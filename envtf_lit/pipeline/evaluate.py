@@ -1,17 +1,25 @@
 """The stage `evaluate`: scores policies and the world model."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from envtf_lit.agents.levels import CLONE
 from envtf_lit.agents.options import NO_WORLD_MODEL
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.horizon import horizon_report
-from envtf_lit.evaluation.metrics import collect_metrics, collect_offline_metrics, world_model_metrics
+from envtf_lit.evaluation.metrics import (
+    collect_metrics,
+    collect_offline_metrics,
+    held_out_metrics,
+    world_model_metrics,
+)
 from envtf_lit.evaluation.offline import evaluate_offline
+from envtf_lit.evaluation.promises import read_frontier
 from envtf_lit.figures import gallery
 from envtf_lit.figures.video import ghost_over_real, no_video, real_vs_imagined
 from envtf_lit.files import check_plain, replacing, write_json
@@ -28,8 +36,9 @@ from envtf_lit.pipeline.stage import (
     rollouts_file,
     run_stage,
 )
-from envtf_lit.policy import load_policy
-from envtf_lit.robots.returns import evaluate_policy
+from envtf_lit.policy import Policy, load_policy
+from envtf_lit.robots.returns import Returns, evaluate_policy
+from envtf_lit.robots.tasks import Robot
 from envtf_lit.training import CURVES
 from envtf_lit.world_models.forecast import Scale, whole_episodes
 from envtf_lit.world_models.store import load_world_model
@@ -65,6 +74,8 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
             rollouts={"transitions": len(rollouts)},
             labels=_labels(params),
         )
+        estimates = evaluate_offline(model, {} if robot else policies, report, training)
+        frontiers = {policy: table for policy, place in folders.items() if (table := read_frontier(place)) is not None}
         with replacing(root / PLOTS) as plots, replacing(root / VIDEO) as video:
             plots.mkdir()
             video.mkdir()
@@ -73,28 +84,42 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
             gallery.draw_rollouts(rollouts, plots)
             gallery.draw_policy_curves(curves, _labels(params), plots)
             if robot is None:
-                estimates = evaluate_offline(model, policies, report, training)
-                metrics = collect_offline_metrics(estimates, **facts)
+                metrics, measured = collect_offline_metrics(estimates, **facts), {}
                 gallery.draw_estimates(estimates, _labels(params), plots)
                 no_video(video)
             else:
-                returns = {
-                    policy: evaluate_policy(
-                        actor, robot, episodes=options.episodes, seed=params.seed, progress=progress
-                    )
-                    for policy, actor in policies.items()
-                }
+                clones = {f"{policy}/{CLONE}": load_policy(folders[policy] / CLONE) for policy in frontiers}
+                returns = _play(policies, params, robot, progress)
+                measured = {name: _mean(found) for name, found in returns.items()}
+                measured |= {name: _mean(found) for name, found in _play(clones, params, robot, progress).items()}
+                facts |= {"held_out": held_out_metrics(estimates)}
                 metrics = collect_metrics(returns, task=str(params.task), source=source, robot=robot, **facts)
                 gallery.draw_scores(dataset, source, robot, returns, _labels(params), plots)
                 episode, gif = list(returns.values())[-1].median, video / "real_vs_imagined.gif"
                 real_vs_imagined(model, episode, robot, scale, gif, frames=options.video_frames)
                 ghost_over_real(model, episode, robot, scale, video / "ghost.gif", frames=options.video_frames)
+            gallery.draw_frontiers(frontiers, metrics["held_out"], dataset, source, _labels(params), measured, plots)
         for policy, options in params.train_policy.items():
             imagined_in = None if options.world_model == NO_WORLD_MODEL else options.world_model
             metrics["policies"][policy] |= {"algorithm": algorithm_of(options), "world_model": imagined_in}
             metrics["policies"][policy]["effective_episodes"] = _last(curves[policy], EFFECTIVE)
+            if (clone := measured.get(f"{policy}/{CLONE}")) is not None:
+                metrics["policies"][policy] |= {"clone_return_mean": clone}
         write_json(root / METRICS, metrics)
     return metrics
+
+
+def _play(policies: Mapping[str, Policy], params: Params, robot: Robot, progress: bool) -> dict[str, Returns]:
+    """Episodes of each policy, by name, from the same starts."""
+    episodes = params.evaluate.episodes
+    return {
+        name: evaluate_policy(actor, robot, episodes=episodes, seed=params.seed, progress=progress)
+        for name, actor in policies.items()
+    }
+
+
+def _mean(found: Returns) -> float:
+    return float(found.returns.mean())
 
 
 MOST_CURVES = 16 << 20  # bytes

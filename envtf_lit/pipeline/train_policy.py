@@ -89,7 +89,8 @@ def train_policy(
             validate=False,
             callbacks=callbacks,
         ) as curves:
-            return publish_policy(target, agent.average_actor, curves, curves.rows[-1], settings, agent.records())
+            published = agent.average_actor, curves, curves.rows[-1], settings, agent.records(), agent.companions()
+            return publish_policy(target, *published)
 
 
 def within_reach(options: MixingOptions, model: Path) -> MixingOptions:
