@@ -20,9 +20,10 @@ from envtf_lit.evaluation.metrics import (
     world_model_metrics,
 )
 from envtf_lit.evaluation.offline import OfflineEstimate, OfflineEstimates
+from envtf_lit.evaluation.promises import Places
 from envtf_lit.figures import gallery
 from envtf_lit.figures.video import no_video, write_gif
-from envtf_lit.files import write_json
+from envtf_lit.files import write_json, write_table
 from envtf_lit.imagination.rollouts import Rollouts
 from envtf_lit.robots.returns import Episode, Returns
 from envtf_lit.robots.tasks import ROBOTS
@@ -72,12 +73,11 @@ def some_estimates() -> OfflineEstimates:
     return OfflineEstimates(recorded=recorded, imagined=recorded + 10.0, lengths=lengths, policies=policies)
 
 
-def some_frontier(kept: int = 2) -> pd.DataFrame:
+def some_frontier(kept: int = 2) -> Places:
     """The clone and two actors further out, of which one is published; the last strays from what the model knows."""
     columns = ("update", "excess", "promise", "error", "lost", "steps")
     rows = [(0, 0.0, 310.0, 2.0, 0.001, 45.0), (200, 0.05, 350.0, 3.0, 0.002, 45.0), (400, 0.2, 420.0, 5.0, 0.03, 90.0)]
-    table = pd.DataFrame(rows, columns=columns)
-    return table.assign(kept=[int(place == kept) for place in range(3)])
+    return [dict(zip(columns, row, strict=True)) | {"kept": float(place == kept)} for place, row in enumerate(rows)]
 
 
 def made_up_run(root: Path, source: str = "file", *, simulator: bool = True) -> Path:
@@ -106,7 +106,7 @@ def made_up_run(root: Path, source: str = "file", *, simulator: bool = True) -> 
     for name, table in tables.items():
         (root / "models" / name).mkdir(parents=True)
         table.to_csv(root / "models" / name / "curves.csv", index=False)
-    some_frontier().to_csv(root / "models/policy/dreamer/frontier.csv", index=False)
+    write_table(root / "models/policy/dreamer/frontier.csv", some_frontier())
     write_json(root / "models/policy/dreamer/resolved.json", {"options": {"trust": "default"}})
     found = {"termination_recall": 0.5, "termination_false_alarms": 0.01}
     write_json(root / "models/world_model/small/metrics.json", found)

@@ -186,7 +186,7 @@ def test_policies_never_saw_the_held_out_episodes_and_act_in_the_files_own_range
     dataset = load_dataset(root / "data/dataset.h5")
     training, held_out = dataset.split()
     assert len(held_out.episode_starts) == 3
-    for name in ("bc", "cql", "et_cql"):
+    for name in ("bc", "cql", "et_cql", "et_cql/clone"):
         policy = load_policy(root / "models/policy" / name)
         mean, _ = training.observation_scale()
         torch.testing.assert_close(policy.observation_mean, mean)
@@ -198,7 +198,7 @@ def test_there_are_plots_and_in_place_of_the_video_a_sentence(finished: tuple[Pa
     root, _ = finished
     assert "no simulator" in (root / "reports/video/none.txt").read_text()
     plots = {path.name for path in (root / "reports/plots").iterdir()}
-    assert {"scores.png", "horizon.png", "calibration.png", "policy_curves.png", "traces.png"} <= plots
+    assert {"scores.png", "horizon.png", "calibration.png", "policy_curves.png", "traces.png", "frontier.png"} <= plots
 
 
 def test_the_report_says_that_nobody_measured_a_return(finished: tuple[Path, Params], repository: Path):
@@ -208,7 +208,7 @@ def test_the_report_says_that_nobody_measured_a_return(finished: tuple[Path, Par
     (root / name).write_bytes((repository / name).read_bytes())
     report(params, root, progress=False)
     text = said(root / "reports/report.ipynb")
-    assert "Only the robot can tell" in text
+    assert "Only the robot can tell" in text and "**Try first" in text
     assert "a classifier learned from the log says so" in text
     assert "No video" in text
     assert "D4RL" not in text and "hop" not in text.lower()

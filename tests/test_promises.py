@@ -16,12 +16,13 @@ from matplotlib.figure import Figure
 from envtf_lit.agents.levels import LEVELS
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.metrics import held_out_metrics
-from envtf_lit.evaluation.promises import Range, kept, promised_range, read_frontier
+from envtf_lit.evaluation.promises import Places, Range, kept, promised_range, read_frontier
 from envtf_lit.figures import frontier as frontier_module
 from envtf_lit.figures import promises
 from envtf_lit.figures.frontier import frontier_picture
 from envtf_lit.figures.report import Run, read_run
 from envtf_lit.figures.style import drawing
+from envtf_lit.files import write_table
 
 HELD_OUT = held_out_metrics(some_estimates())  # the model imagines 10 more than was recorded, in 45 steps
 
@@ -46,11 +47,9 @@ def test_a_range_holds_the_models_doubt_and_its_error_on_recorded_actions_for_ea
 
 def test_a_frontier_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert read_frontier(tmp_path) is None
-    some_frontier(1).to_csv(tmp_path / "frontier.csv", index=False)
-    table = read_frontier(tmp_path)
-    assert table is not None
-    pd.testing.assert_frame_equal(table, some_frontier(1), check_dtype=False)
-    assert kept(table)["update"] == 200
+    write_table(tmp_path / "frontier.csv", some_frontier(1))
+    assert read_frontier(tmp_path) == some_frontier(1)
+    assert kept(some_frontier(1))["update"] == 200
 
 
 @pytest.mark.parametrize(
@@ -92,19 +91,21 @@ def test_the_picture_marks_clone_published_and_measured_and_the_log(
         measured={"a": 250.0, "a/clone": 280.0, "bc": 1.0},
     )
     axis = seen[0].axes[0]
-    points = {}
+    points: dict[str, list[tuple[float, float]]] = {}
     for shown in axis.collections:
         if isinstance(shown, PathCollection):
-            points.setdefault(shown.get_label(), []).append(tuple(np.asarray(shown.get_offsets())[0]))
+            points.setdefault(str(shown.get_label()), []).append(tuple(np.array(shown.get_offsets())[0].tolist()))
     assert points == {
         "the clone": [(0.0, 310.0)],
         "published": [(0.2, 420.0)],
         "measured": [(0.0, 280.0), (0.2, 250.0)],
     }
-    assert [line.get_ydata()[0] for line in axis.lines if line.get_label() == "the log's mean episode"] == [300.0]
+    assert [np.array(line.get_ydata())[0] for line in axis.lines if line.get_label() == "the log's mean episode"] == [
+        300
+    ]
     assert [text.get_text().split(":")[0] for text in axis.texts] == ["cautious"]  # the others lie beyond
     table = pd.read_csv(tmp_path / "f.csv")
-    expected = [promised_range(row, HELD_OUT) for row in some_frontier().to_dict("records")]
+    expected = [promised_range(row, HELD_OUT) for row in some_frontier()]
     np.testing.assert_allclose(table["low"], [found.low for found in expected], rtol=1e-5)
     np.testing.assert_allclose(table["high"], [found.high for found in expected], rtol=1e-5)
 
@@ -117,7 +118,7 @@ def offline(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return read_run(made_up_run(tmp_path_factory.mktemp("offline"), simulator=False), simulator=False)
 
 
-def changed(run: Run, table: pd.DataFrame | None = None, *, recorded: float = 320.0, trust: str = "default") -> Run:
+def changed(run: Run, table: Places | None = None, *, recorded: float = 320.0, trust: str = "default") -> Run:
     """The run with another frontier, mean recorded return, or level of trust."""
     told = replace(run, card=run.card | {"returns": {"mean": recorded}})
     vars(told)["frontiers"] = {"dreamer": some_frontier() if table is None else table}
@@ -150,7 +151,7 @@ def test_policies_beyond_the_log_are_called_so_for_distance_and_for_straying(off
     near = promises.first_to_try(changed(offline, some_frontier(1)))
     assert "beyond the log" not in near
     strays = some_frontier(1)
-    strays.loc[1, "lost"] = 0.02
+    strays[1]["lost"] = 0.02
     text = promises.first_to_try(changed(offline, strays))
     assert "**ET + CQL acts beyond the log**: in 2.0% of its imagined steps" in text and "less likely" not in text
 

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -11,6 +10,7 @@ from envtf_lit.agents.levels import COLUMNS, FRONTIER
 from envtf_lit.errors import UserError
 from envtf_lit.files import check_plain
 
+Places = list[dict[str, float]]  # what a frontier.csv says of each actor, from the clone outward
 MOST_BYTES = 1 << 20  # of a frontier.csv
 ERRORS = 2.0  # standard errors of a promise that its range reaches to either side
 
@@ -26,7 +26,7 @@ class Range:
         return self.low <= value <= self.high
 
 
-def promised_range(row: Mapping[str, Any], held_out: Mapping[str, float]) -> Range:
+def promised_range(row: Mapping[str, float], held_out: Mapping[str, float]) -> Range:
     """The mean return that an actor of the frontier is promised, as a range: `promise -+ (2 error + steps |b|)`.
 
     `b` is what the model errs by per step where the truth is known: of the held-out episodes, whose actions it is given
@@ -39,11 +39,11 @@ def promised_range(row: Mapping[str, Any], held_out: Mapping[str, float]) -> Ran
         held_out: of the metrics (`metrics.held_out_metrics`).
     """
     bias = abs(held_out["imagined_return_mean"] - held_out["return_mean"]) / max(1.0, held_out["steps_mean"])
-    reach = ERRORS * float(row["error"]) + bias * float(row["steps"])
-    return Range(float(row["promise"]) - reach, float(row["promise"]) + reach)
+    reach = ERRORS * row["error"] + bias * row["steps"]
+    return Range(row["promise"] - reach, row["promise"] + reach)
 
 
-def read_frontier(folder: Path) -> pd.DataFrame | None:
+def read_frontier(folder: Path) -> Places | None:
     """The frontier in a policy's folder, from the clone outward; None of a policy that has none.
 
     Raises:
@@ -58,12 +58,12 @@ def read_frontier(folder: Path) -> pd.DataFrame | None:
     except (UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError):
         table = pd.DataFrame()
     lacking = {*COLUMNS, "kept"} - {*table.columns}
-    if lacking or not (table.notna().all(axis=None) and (table["kept"] == 1).sum() == 1):
+    if lacking or not (bool(table.notna().to_numpy().all()) and list(table["kept"]).count(1) == 1):
         what = f"it has no {' and no '.join(sorted(lacking))}" if lacking else "it does not name one actor as kept"
         raise UserError(f"{path} is damaged or of another version ({what}): train the policy anew.")
-    return table
+    return [{str(name): float(value) for name, value in row.items()} for row in table.to_dict("records")]
 
 
-def kept(frontier: pd.DataFrame) -> pd.Series:
-    """The row of the published actor."""
-    return frontier[frontier["kept"] == 1].iloc[0]
+def kept(frontier: Places) -> dict[str, float]:
+    """What is said of the published actor."""
+    return next(row for row in frontier if row["kept"] == 1)

@@ -7,12 +7,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from envtf_lit.agents.levels import CLONE, LEVELS
-from envtf_lit.evaluation.promises import ERRORS, kept, promised_range
+from envtf_lit.evaluation.promises import ERRORS, Places, kept, promised_range
 from envtf_lit.figures.style import COLOURS, drawing, policy_colours, write_table
 
 
 def frontier_picture(
-    frontiers: Mapping[str, pd.DataFrame],
+    frontiers: Mapping[str, Places],
     path: str | Path,
     *,
     held_out: Mapping[str, float],
@@ -37,7 +37,11 @@ def frontier_picture(
         axis.axhline(recorded, color=COLOURS["recorded"], linestyle="--", linewidth=1.2, label="the log's mean episode")
         for name, table in tables.items():
             _draw(axis, table, colours[name], policies[name] if len(tables) > 1 else "promised")
-            for row, key in ((table.iloc[0], f"{name}/{CLONE}"), (kept(table), name)):
+            marked = (frontiers[name][0], "D", 90, "the clone"), (kept(frontiers[name]), "o", 170, "published")
+            for row, marker, size, words in marked:
+                axis.scatter(row["excess"], row["promise"], s=size, marker=marker, facecolors="none",
+                             edgecolors="black", linewidths=1.6, label=words, zorder=4)  # fmt: skip
+            for row, key in ((frontiers[name][0], f"{name}/{CLONE}"), (kept(frontiers[name]), name)):
                 if key in measured:
                     axis.scatter(row["excess"], measured[key], s=130, marker="*", color=colours[name],
                                  edgecolors="black", zorder=5, label="measured")  # fmt: skip
@@ -59,9 +63,9 @@ def frontier_picture(
     return Path(path)
 
 
-def _with_ranges(frontier: pd.DataFrame, held_out: Mapping[str, float]) -> pd.DataFrame:
-    ranges = [promised_range(row, held_out) for row in frontier.to_dict("records")]
-    return frontier.assign(low=[found.low for found in ranges], high=[found.high for found in ranges])
+def _with_ranges(frontier: Places, held_out: Mapping[str, float]) -> pd.DataFrame:
+    ranges = [promised_range(row, held_out) for row in frontier]
+    return pd.DataFrame(frontier).assign(low=[found.low for found in ranges], high=[found.high for found in ranges])
 
 
 def _draw(axis: Axes, table: pd.DataFrame, colour: str, label: str) -> None:
@@ -72,7 +76,3 @@ def _draw(axis: Axes, table: pd.DataFrame, colour: str, label: str) -> None:
         table["excess"], table["promise"], ERRORS * table["error"], color=colour, fmt="o", markersize=5, elinewidth=3,
         label=label, zorder=3,
     )  # fmt: skip
-    clone, published = table.iloc[0], kept(table)
-    for row, marker, size, words in ((clone, "D", 90, "the clone"), (published, "o", 170, "published")):
-        axis.scatter(row["excess"], row["promise"], s=size, marker=marker, facecolors="none", edgecolors="black",
-                     linewidths=1.6, label=words, zorder=4)  # fmt: skip

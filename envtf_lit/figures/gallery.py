@@ -10,6 +10,7 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.horizon import HorizonReport
 from envtf_lit.evaluation.metrics import comparable
 from envtf_lit.evaluation.offline import OfflineEstimates
+from envtf_lit.evaluation.promises import Places
 from envtf_lit.figures import learning, model, scores
 from envtf_lit.figures.frontier import frontier_picture
 from envtf_lit.figures.style import write_table
@@ -91,7 +92,7 @@ def draw_estimates(estimates: OfflineEstimates, labels: Mapping[str, str], folde
 
 
 def draw_frontiers(
-    frontiers: Mapping[str, pd.DataFrame],
+    frontiers: Mapping[str, Places],
     held_out: Mapping[str, float],
     dataset: OfflineDataset,
     source: str,

@@ -22,7 +22,7 @@ def frontier_table(run: Run) -> pd.DataFrame:
             "": "published" if row["kept"] == 1 else "",
         }
         for name, table in run.frontiers.items()
-        for place, row in enumerate(table.to_dict("records"))
+        for place, row in enumerate(table)
     ]
     return pd.DataFrame(rows)
 
@@ -59,7 +59,7 @@ def _about(run: Run, name: str) -> str:
 def _why(run: Run, name: str) -> str:
     """Which actor is published, and for what."""
     table, price = run.frontiers[name], LEVELS[run.trust(name)].price
-    clone, row = table.iloc[0], kept(table)
+    clone, row = table[0], kept(table)
     if row["update"] == clone["update"]:
         cost = f", and {price:.0%} for each nat of distance" if price else ""
         return f"Published is the clone: nobody further out was promised enough more, {LEAST_GAIN:.0%} at least{cost}."
@@ -74,7 +74,7 @@ def _why(run: Run, name: str) -> str:
 def _beyond(run: Run, name: str) -> str:
     """A warning where a policy acts beyond the log; else nothing."""
     table = run.frontiers[name]
-    clone, row = table.iloc[0], kept(table)
+    clone, row = table[0], kept(table)
     reasons = []
     if row["excess"] > NEAR:
         reasons.append(
@@ -118,8 +118,7 @@ def _before(run: Run, name: str) -> str:
     table, levels = run.frontiers[name], [run.trust(other) for other in run.frontiers]
     if kept(table)["excess"] <= NEAR or "cautious" in levels:
         return ""
-    near = table[table["excess"] <= NEAR]
-    best = near.loc[near["promise"].idxmax()]
+    best = max((row for row in table if row["excess"] <= NEAR), key=lambda row: row["promise"])
     return (
         f"Before it, train and try `trust: cautious`, which goes {NEAR:g} nats and no further: up to there this one's "
         f"training was promised {_words(promised_range(best, run.held_out))}."

@@ -10,7 +10,7 @@ import pandas as pd
 
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.comparison import Comparison, compare
-from envtf_lit.evaluation.promises import read_frontier
+from envtf_lit.evaluation.promises import Places, read_frontier
 from envtf_lit.figures.inline import show_picture
 from envtf_lit.files import read_json
 
@@ -107,7 +107,7 @@ class Run:
         return f"{value:{sign},.1f}" if decimal else f"{value:{sign}.3g}"
 
     @cached_property
-    def frontiers(self) -> dict[str, pd.DataFrame]:
+    def frontiers(self) -> dict[str, Places]:
         """What is known of the actors between log and policy, from the clone outward, of policies that say so."""
         tables = {name: read_frontier(self.policy_folder(name)) for name in self.policies}
         return {name: table for name, table in tables.items() if table is not None}
