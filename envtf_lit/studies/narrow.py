@@ -190,7 +190,7 @@ class _Project:
             "promised_high": promise.high,
             "promise_held": earned in promise,
             "update": int(row["update"]),
-            "excess": float(row["excess"]),
+            "excess": row["excess"],
             "of_recorded": earned / recorded,
             "of_clone": earned / clone,
             "harmless": bool(_enough(earned, recorded, OF_RECORDED) and _enough(earned, clone, OF_CLONE)),
