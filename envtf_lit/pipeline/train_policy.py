@@ -80,7 +80,15 @@ def train_policy(
             progress=progress,
             validate=False,
         ) as curves:
-            return publish_policy(target, agent.average_actor, curves, curves.rows[-1], settings, agent.records())
+            return publish_policy(
+                target,
+                agent.average_actor,
+                curves,
+                curves.rows[-1],
+                settings,
+                critics=agent.published_critics(),
+                records=agent.records(),
+            )
 
 
 def within_reach(options: MixingOptions, model: Path) -> MixingOptions:
