@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from envtf_lit.registration import register_environment
 
 if TYPE_CHECKING:
+    from envtf_lit.critics import load_critics
     from envtf_lit.data.sources.files import load_dataset
     from envtf_lit.policy import load_policy
     from envtf_lit.world_models.store import load_world_model
@@ -13,11 +14,12 @@ if TYPE_CHECKING:
     __version__: str
 
 _EXPORTS = {
+    "load_critics": "envtf_lit.critics",
     "load_dataset": "envtf_lit.data.sources.files",
     "load_policy": "envtf_lit.policy",
     "load_world_model": "envtf_lit.world_models.store",
 }
-__all__ = ["__version__", "load_dataset", "load_policy", "load_world_model"]
+__all__ = ["__version__", "load_critics", "load_dataset", "load_policy", "load_world_model"]
 
 register_environment()
 

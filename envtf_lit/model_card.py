@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from envtf_lit.actors import Actor, kind_of
+from envtf_lit.critics import CRITICS
 from envtf_lit.errors import UserError
 from envtf_lit.files import read_json
 from envtf_lit.sharing import Model, load_model
@@ -48,7 +49,7 @@ def model_card(folder: str | Path, *, report: str | Path | None = None, licence:
     parts = [
         "---\n" + "\n".join(f"{key}: {json.dumps(value)}" for key, value in front.items()) + "\n---",
         f"# {name}\n\n{WHAT[kind]}",
-        f"```python\nimport envtf_lit\n\n{_use(model)}\n```",
+        f"```python\nimport envtf_lit\n\n{_use(model, folder)}\n```",
         *_section("Data", _data(found)),
         *_section("Scores", _scores(model, name, found) | _numbers(_record(folder / "metrics.json"))),
         *([] if isinstance(model, Actor) else _section("Calibration", _calibration(name, found))),
@@ -118,9 +119,12 @@ def _options(settings: dict[str, Any]) -> list[str]:
     return [f"## Settings\n\n```json\n{text}\n```"]
 
 
-def _use(model: Model) -> str:
+def _use(model: Model, folder: Path) -> str:
     if isinstance(model, Actor):
-        return 'policy = envtf_lit.load_policy("FOLDER")\naction = policy.act(observation)  # (B, S) to (B, A)'
+        lines = ['policy = envtf_lit.load_policy("FOLDER")', "action = policy.act(observation)  # (B, S) to (B, A)"]
+        if (folder / CRITICS).is_dir():
+            lines.append('value = envtf_lit.load_critics("FOLDER").value(observation)  # (B,), of discounted rewards')
+        return "\n".join(lines)
     return 'model = envtf_lit.load_world_model("FOLDER")\nstate, prediction = model.step(state, action)'
 
 

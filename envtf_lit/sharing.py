@@ -18,6 +18,7 @@ import requests
 from torch import nn
 
 from envtf_lit.actors import POLICIES, Actor
+from envtf_lit.critics import CRITICS, load_critics
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import read_json, replacing, write_text
 from envtf_lit.policy import load_policy
@@ -34,8 +35,7 @@ NEEDED = {"config.json": JSON_BYTES, "weights.safetensors": WEIGHTS_BYTES}
 ALLOWED = NEEDED | {
     "metrics.json": JSON_BYTES,
     "resolved.json": JSON_BYTES,
-    f"{TERMINATION}/config.json": JSON_BYTES,
-    f"{TERMINATION}/weights.safetensors": WEIGHTS_BYTES,
+    **{f"{part}/{name}": most for part in (CRITICS, TERMINATION) for name, most in NEEDED.items()},
 }
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
 TIMEOUT = (10, 60)  # seconds: to connect, between two pieces
@@ -119,6 +119,8 @@ def _check(folder: Path) -> Model:
             read_json(folder / name)
     if (folder / TERMINATION).is_dir():
         load_termination(folder / TERMINATION)
+    if (folder / CRITICS).is_dir():
+        load_critics(folder)
     return model
 
 

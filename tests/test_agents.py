@@ -13,8 +13,8 @@ from envtf_lit.agents.bc import BC
 from envtf_lit.agents.combo import COMBO
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.et_cql import ETCQL, ETCQLPaper
-from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.sac import SAC
+from envtf_lit.critics import StackedCritics
 from envtf_lit.errors import UserError
 from tests.hand_driven import SHORT, B, S, hand_driven, imagining, make_batch
 

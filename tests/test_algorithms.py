@@ -12,7 +12,9 @@ import pytest
 import torch
 
 from envtf_lit.actors import kind_of
+from envtf_lit.agents.actor_critic import ActorCritic
 from envtf_lit.agents.registry import ALGORITHMS
+from envtf_lit.critics import load_critics
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.figures.style import COLOURS, policy_colours
 from envtf_lit.files import read_json
@@ -89,7 +91,14 @@ def test_an_algorithm_is_trained_and_its_policy_acts(name: str, project: tuple[P
     assert kind_of(policy) == kinds.get(name, "tanh_gaussian")
     action = policy.act(torch.as_tensor(walker_dataset(episodes=1).observations))
     assert action.shape == (20, 3) and action.abs().max() <= 1.0
-    assert read_json(root / "models/policy" / name / "resolved.json")["algorithm"] == name
+    settings = read_json(root / "models/policy" / name / "resolved.json")
+    assert settings["algorithm"] == name
+    judged = issubclass(ALGORITHMS[name], ActorCritic)
+    assert (root / "models/policy" / name / "critics").exists() == judged
+    if judged:
+        critics = load_critics(root / "models/policy" / name)
+        assert critics.critics.discount == settings["options"]["discount"]
+        assert critics.value(torch.as_tensor(walker_dataset(episodes=1).observations)).isfinite().all()
     if before is not None:
         after = load_world_model(root / "models/world_model" / model).state_dict()
         assert all(torch.equal(value, before[key]) for key, value in after.items())

@@ -16,6 +16,7 @@ from envtf_lit import load_policy, load_world_model
 from envtf_lit.agents.bc import BC
 from envtf_lit.agents.cql import CQL, CQLOptions
 from envtf_lit.cli.main import main
+from envtf_lit.critics import load_critics
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.loaders import Transitions
 from envtf_lit.data.sources.files import load_dataset, save_dataset
@@ -100,6 +101,9 @@ def test_agent_fit_publishes_a_policy_with_the_datas_scale_and_limits(
     saved = torch.load(checkpoint, weights_only=True)
     assert saved["hyper_parameters"]["action_low"] == [-2.0] * 3
     assert all(torch.equal(saved["state_dict"][f"average_actor.{k}"], v) for k, v in policy.state_dict().items())
+    critics = load_critics(".envtf/published").critics
+    assert critics.return_scale == saved["state_dict"]["return_scale"] > 0
+    assert all(torch.equal(saved["state_dict"][f"critics.{k}"], v) for k, v in critics.stack.state_dict().items())
 
 
 def test_agent_fit_trains_the_algorithm_that_is_named(folder: Path) -> None:

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.agents.cql import CQL
-from envtf_lit.agents.networks import StackedCritics, StateValue
+from envtf_lit.agents.networks import StateValue
+from envtf_lit.critics import StackedCritics
 from tests.hand_driven import B, S, hand_driven, imagination, make_batch
 
 A, PAIRS = 2, 4_096

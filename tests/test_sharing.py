@@ -11,6 +11,7 @@ from ruamel.yaml import YAML
 from envtf_lit import sharing
 from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.cli.main import main
+from envtf_lit.critics import Critics, load_critics, save_critics
 from envtf_lit.errors import UserError
 from envtf_lit.files import write_json
 from envtf_lit.model_card import model_card
@@ -30,6 +31,13 @@ def policy(tmp_path: Path) -> Path:
     write_json(folder / "resolved.json", {"algorithm": "cql", "seed": 0})
     (folder / "curves.csv").write_text("epoch\n1\n")
     return folder
+
+
+@pytest.fixture
+def judged(policy: Path) -> Path:
+    """The policy, with critics."""
+    save_critics(policy, Critics(3, 2, n=2, hidden=(8,), layer_norm=True, discount=0.9))
+    return policy
 
 
 @pytest.fixture
@@ -74,6 +82,24 @@ def test_a_world_model_brings_its_termination_head(world: Path, tmp_path: Path) 
     push(world, str(tmp_path / "remote"), card)
     pull(str(tmp_path / "remote"), tmp_path / "again")
     assert contents(tmp_path / "again") == contents(world)
+
+
+def test_a_policy_brings_its_critics(hub: Hub, judged: Path, tmp_path: Path) -> None:
+    push(judged, str(tmp_path / "remote"), card)
+    hub.files["a/b"] = contents(tmp_path / "remote")
+    pull("hf:a/b", tmp_path / "again")
+    came = contents(tmp_path / "again")
+    assert came == {name: value for name, value in contents(judged).items() if name != "curves.csv"}
+    observation = torch.randn(4, 3)
+    assert torch.equal(load_critics(tmp_path / "again").value(observation), load_critics(judged).value(observation))
+    assert "envtf_lit.load_critics" in card(judged)
+
+
+def test_critics_are_checked_as_the_policy_is(judged: Path, tmp_path: Path) -> None:
+    torch.save({}, judged / "critics/weights.safetensors")
+    with pytest.raises(UserError, match=r"critics/weights\.safetensors is not a safetensors file"):
+        pull(str(judged), tmp_path / "again")
+    assert not (tmp_path / "again").exists()
 
 
 def test_nothing_that_stands_there_is_replaced(policy: Path, tmp_path: Path) -> None:
@@ -227,6 +253,7 @@ def test_a_card_says_what_is_known(policy: Path, tmp_path: Path, monkeypatch: py
     for line in ("# mine", "| task | hopper-medium-replay |", "| transitions | 100000 |", "| score_mean | 93.92 |"):
         assert f"\n{line}\n" in text, line
     assert "actions from [-1.0, -1.0] to [1.0, 1.0]" in text and '"algorithm": "cql"' in text
+    assert "load_critics" not in text
     assert "| clone_loss | -3.25 |" in text and "| envtf-lit |" in text and "Calibration" not in text
     with pytest.raises(SystemExit):
         main(["card", "models/mine"])

@@ -110,7 +110,7 @@ def killed(*_: object, **__: object) -> None:
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
-    return {p.name: p.read_bytes() for p in sorted(folder.iterdir())}
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def train_whole(root: Path, params: Params = TINY) -> dict[str, bytes]:

@@ -16,6 +16,7 @@ from envtf_lit.agents.frontier import Frontier
 from envtf_lit.agents.levels import LEAST_GAIN, LEVELS
 from envtf_lit.agents.trust import Trust
 from envtf_lit.agents.value_gradient import ImaginedPaths, ValueGradientOptions
+from envtf_lit.critics import StackedCritics
 from envtf_lit.data.loaders import DrawnRows
 from envtf_lit.imagination import promise as promise_module
 from envtf_lit.imagination.histories import BranchPoints
@@ -184,12 +185,14 @@ def test_episodes_that_fell_say_nothing_about_a_time_limit(monkeypatch):
 )
 def test_the_log_is_left_for_a_clear_gain_alone(promises, errors, price, kept):
     actors = [make_actor(seed) for seed in range(3)]
-    frontier = Frontier(actors[0], 4)
+    critics = [StackedCritics(3, 1, hidden=(8,), layer_norm=False) for _ in range(3)]
+    frontier = Frontier(actors[0], critics[0], 4)
     for place, (mean, error) in enumerate(zip(promises, errors, strict=True)):
         promise = Promise(mean, error, lost=0.01, steps=9.0)
-        frontier.add(actors[place], update=place, excess=0.1 * place, promise=promise)
+        frontier.add(actors[place], critics[place], update=place, excess=0.1 * place, promise=promise)
     chosen = frontier.choose(price)
     assert torch.equal(flat(chosen.state_dict()), flat(actors[kept].state_dict()))
+    assert torch.equal(flat(frontier.critics[kept].state_dict()), flat(critics[kept].state_dict()))
     rows = frontier.rows()
     assert [row["kept"] for row in rows] == [int(place == kept) for place in range(3)]
     assert [row["promise"] for row in rows] == promises and rows[2]["excess"] == pytest.approx(0.2)
@@ -234,6 +237,8 @@ def test_a_whole_training_publishes_what_its_trust_allows(level):
     assert [row["update"] for row in rows] == [0.0, 10.0, 20.0, 30.0, 40.0]
     kept = next(place for place, row in enumerate(rows) if row["kept"])
     assert torch.equal(flat(agent.average_actor.state_dict()), flat(agent.frontier.actors[kept].state_dict()))
+    published = agent.published_critics()
+    assert torch.equal(flat(published.stack.state_dict()), flat(agent.frontier.critics[kept].state_dict()))
     assert rows[-1]["excess"] < LEVELS[level].slack + 0.3
     (clone,) = agent.companions().values()
     assert torch.equal(flat(clone.state_dict()), flat(agent.frontier.actors[0].state_dict()))

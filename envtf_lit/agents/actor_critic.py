@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit.agents.agent import Agent
-from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.phases import Batch, Logs, Losses, Phase, follow
 from envtf_lit.agents.warm_start import WarmStart
+from envtf_lit.critics import Critics, StackedCritics
 
 WARM_TARGET_RATE = 0.05  # share of the critics that enters the target networks at each update of the warm start
 CRITICS = 2  # of which targets and actor take the smallest
@@ -69,6 +69,21 @@ class ActorCritic(Agent):
     def end_warm_start(self) -> None:
         self.target_critics.load_state_dict(self.critics.state_dict())
         super().end_warm_start()
+
+    def published_critics(self) -> Critics:
+        o = self.options
+        with torch.random.fork_rng(devices=()):  # initial weights are drawn for nothing
+            critics = Critics(
+                self.observation_dim,
+                self.action_dim,
+                n=CRITICS,
+                hidden=o.hidden,
+                layer_norm=o.layer_norm,
+                discount=o.discount,
+            )
+        critics.stack.load_state_dict(self.critics.state_dict())
+        critics.return_scale.copy_(self.return_scale)
+        return critics
 
     def validation_logs(self, batch: Batch) -> Logs:
         q = self.return_scale * self.critics(batch["observations"], batch["actions"]).min(0).values

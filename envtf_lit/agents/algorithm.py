@@ -15,6 +15,7 @@ from envtf_lit.actors import Actor, TanhGaussianActor
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.phases import Batch, Logs, Losses, Part, Phase, follow
 from envtf_lit.agents.scales import LogReturns
+from envtf_lit.critics import Critics
 from envtf_lit.divergence import Bound
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.buffer import ImaginedBatches
@@ -162,6 +163,10 @@ class Algorithm(L.LightningModule, ABC):
     def validation_logs(self, batch: Batch) -> Logs:
         """Further scalars to log of held-out rows."""
         return {}
+
+    def published_critics(self) -> Critics | None:
+        """What the policy is published with to judge it; None where the algorithm learns no critics."""
+        return None
 
     def records(self) -> dict[str, list[dict[str, Any]]]:
         """Tables to publish beside the policy, by name; each row's columns are alike."""

@@ -16,6 +16,7 @@ from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.phases import Batch, Logs, Losses, Part, Phase
 from envtf_lit.agents.trust import Trust, WatchedWarmStart
 from envtf_lit.agents.value_gradient import BETAS, PLACES, ValueGradient, ValueGradientOptions
+from envtf_lit.critics import Critics
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.options import RolloutOptions
@@ -128,7 +129,7 @@ class ETCQL(COMBO):
     def build_networks(self) -> None:
         ActorCritic.build_networks(self)  # no temperature: nothing here asks for entropy
         self.trust = Trust(self.actor)
-        self.frontier = Frontier(self.actor, 1 + PLACES)
+        self.frontier = Frontier(self.actor, self.critics, 1 + PLACES)
 
     def build_phases(self) -> list[Phase]:
         o = self.options
@@ -157,6 +158,12 @@ class ETCQL(COMBO):
                 "the episodes to hold out, held_out=0.1."
             )
         self.trust.begin(data.validation_rows, self.seed, self.device)
+
+    def published_critics(self) -> Critics:
+        """Those of the actor that was kept, as they were when it was put on the frontier."""
+        critics = super().published_critics()
+        critics.stack.load_state_dict(self.frontier.critics[int(self.frontier.kept)].state_dict())
+        return critics
 
     def records(self) -> dict[str, list[dict[str, Any]]]:
         """The frontier, as `frontier.csv`."""

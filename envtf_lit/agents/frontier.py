@@ -9,14 +9,15 @@ from torch import Tensor, nn
 
 from envtf_lit.actors import Actor
 from envtf_lit.agents.levels import COLUMNS, LEAST_GAIN
+from envtf_lit.critics import StackedCritics
 from envtf_lit.imagination.promise import Promise
 
 
 class Frontier(nn.Module):
-    """Actors in the order in which they left the log; the first is the clone. Part of checkpoints.
+    """Actors in the order in which they left the log, each with critics; the first is the clone. Part of checkpoints.
 
     Args:
-        actor: whose like they are.
+        actor, critics: whose like they are.
         places: for how many there is room.
     """
 
@@ -24,17 +25,19 @@ class Frontier(nn.Module):
     count: Tensor
     kept: Tensor
 
-    def __init__(self, actor: Actor, places: int) -> None:
+    def __init__(self, actor: Actor, critics: StackedCritics, places: int) -> None:
         super().__init__()
         self.actors = nn.ModuleList(copy.deepcopy(actor).requires_grad_(False) for _ in range(places))
+        self.critics = nn.ModuleList(copy.deepcopy(critics).requires_grad_(False) for _ in range(places))
         self.register_buffer("table", torch.full((places, len(COLUMNS)), math.nan, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.long))
         self.register_buffer("kept", torch.zeros((), dtype=torch.long))
 
-    def add(self, actor: Actor, *, update: int, excess: float, promise: Promise) -> None:
+    def add(self, actor: Actor, critics: StackedCritics, *, update: int, excess: float, promise: Promise) -> None:
         """A further actor, `excess` nats per action dimension less likely than the clone."""
         place = int(self.count)
         self.actors[place].load_state_dict(actor.state_dict())
+        self.critics[place].load_state_dict(critics.state_dict())
         row = (float(update), excess, promise.mean, promise.error, promise.lost, promise.steps)
         self.table[place] = torch.tensor(row, dtype=torch.float64)
         self.count += 1

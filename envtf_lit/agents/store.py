@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from envtf_lit.actors import Actor
+from envtf_lit.critics import Critics, save_critics
 from envtf_lit.files import replacing, write_table
 from envtf_lit.policy import save_policy
 from envtf_lit.training import Curves, record_training
@@ -16,6 +17,8 @@ def publish_policy(
     curves: Curves,
     kept: Mapping[str, float],
     settings: dict[str, Any],
+    *,
+    critics: Critics | None = None,
     records: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
     companions: Mapping[str, Actor] | None = None,
 ) -> dict[str, Any]:
@@ -27,6 +30,7 @@ def publish_policy(
         curves: of the training.
         kept: the row of them that belongs to the actor.
         settings: the resolved options.
+        critics: of the policy; None leaves them out.
         records: further tables (`Algorithm.records`), each written as `NAME.csv`.
         companions: further actors (`Algorithm.companions`), each in a folder of its name.
 
@@ -36,6 +40,8 @@ def publish_policy(
     metrics = {name.rpartition("/")[2]: value for name, value in kept.items()}
     with replacing(target) as folder:
         save_policy(folder, actor)
+        if critics is not None:
+            save_critics(folder, critics)
         record_training(folder, metrics, settings, curves)
         for name, rows in (records or {}).items():
             write_table(folder / f"{name}.csv", rows)

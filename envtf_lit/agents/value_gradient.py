@@ -261,9 +261,9 @@ class ValueGradient(Phase):
         return {name: column.detach()[stands] for name, column in columns.items()}
 
     def ask(self, agent: "ETCQL", actor: Actor, update: int) -> None:
-        """Puts an actor on the frontier, with what the world model promises of it."""
+        """Puts an actor on the frontier, with the critics of the moment and what the world model promises of it."""
         promise = promised(self.paths.imagination, actor, episodes=EPISODES, generator=agent.generator)
-        agent.frontier.add(actor, update=update, excess=agent.trust.excess(actor), promise=promise)
+        agent.frontier.add(actor, agent.critics, update=update, excess=agent.trust.excess(actor), promise=promise)
 
     def rate(self, progress: float) -> float:
         """The actor's learning rate after this share of the updates: up over the first tenth, down in the last."""

@@ -46,7 +46,7 @@ class Publish(Callback):
             data: WindowData = trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
             publish_world_model(folder, module, data, curves, row, settings)
         elif isinstance(module, Agent):
-            publish_policy(folder, module.average_actor, curves, row, settings)
+            publish_policy(folder, module.average_actor, curves, row, settings, critics=module.published_critics())
         console().print(f"Published the weights of the {weights}: {folder}")
 
 

@@ -135,7 +135,9 @@ def _labels(params: Params) -> dict[str, str]:
 
 def _last(curves: pd.DataFrame, column: str) -> float | None:
     """A column's last number; None where there is none, as in curves of an earlier version."""
-    logged = curves[column].dropna() if column in curves else ()
+    if column not in curves:
+        return None
+    logged = curves[column].dropna()
     return float(logged.iloc[-1]) if len(logged) else None
 
 

@@ -89,8 +89,16 @@ def train_policy(
             validate=False,
             callbacks=callbacks,
         ) as curves:
-            published = agent.average_actor, curves, curves.rows[-1], settings, agent.records(), agent.companions()
-            return publish_policy(target, *published)
+            return publish_policy(
+                target,
+                agent.average_actor,
+                curves,
+                curves.rows[-1],
+                settings,
+                critics=agent.published_critics(),
+                records=agent.records(),
+                companions=agent.companions(),
+            )
 
 
 def within_reach(options: MixingOptions, model: Path) -> MixingOptions:

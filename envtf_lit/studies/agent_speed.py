@@ -20,10 +20,10 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from envtf_lit.agents.agent import Agent
-from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.phases import follow
 from envtf_lit.agents.registry import ALGORITHMS
+from envtf_lit.critics import StackedCritics
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.options import UPDATES_PER_STEP

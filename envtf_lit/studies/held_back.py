@@ -47,7 +47,9 @@ class Governed:
 
 
 def held_back_log(episodes: int, *, seed: int) -> OfflineDataset:
-    """A log of nearly equal episodes of 1,000 steps, at about 3 m/s, for a governor of 2.5 m/s never brakes. It never shows what a higher speed costs.
+    """A log of nearly equal episodes of 1,000 steps, at about 3 m/s, as a governor of 2.5 m/s lets through.
+
+    It never shows what a higher speed costs.
 
     Args:
         episodes: at least 2.
