@@ -5,12 +5,14 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MKL_NUM_THREADS", "1")
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from envtf_lit.pipeline.yaml import params_yaml, preset_params
+from envtf_lit.world_models.options import EnsembleOptions, WorldModelOptions
 
 torch.set_num_threads(1)
 
@@ -27,6 +29,23 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "params.yaml").write_text(params_yaml(preset_params("tiny")))
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture
+def small_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Transformers of the studies have one small layer; a study takes its time all the same."""
+    from envtf_lit.studies import ablation, suite  # takes seconds, in which most single files are tested
+
+    full_size = suite.model_options
+
+    def small(name: str, options: suite.SuiteOptions) -> WorldModelOptions:
+        found = full_size(name, options)
+        if isinstance(found, EnsembleOptions):
+            return found
+        return replace(found, layers=1, heads=2, width=16, random_features=8)
+
+    for module in (suite, ablation):
+        monkeypatch.setattr(module, "model_options", small)
 
 
 @pytest.fixture

@@ -11,9 +11,10 @@ import pytest
 from PIL import Image
 
 from envtf_lit.errors import UserError
+from envtf_lit.studies import suite
 from envtf_lit.studies.calibration import CONTRASTS, CalibrationOptions, CalibrationStudy
 from envtf_lit.studies.study import run_study
-from envtf_lit.studies.suite import MODELS, SuiteOptions, add_model, build_suite, model_options
+from envtf_lit.studies.suite import MODELS, SuiteOptions, add_model, build_suite
 from envtf_lit.world_models.options import EnsembleOptions
 
 ENSEMBLE = EnsembleOptions(
@@ -40,6 +41,7 @@ def as_drawn(table: pd.DataFrame, numbers: dict[str, float]) -> None:
     assert numbers["rank_correlation"] == pytest.approx(ranks[0, 1])
 
 
+@pytest.mark.usefixtures("small_models")
 @pytest.mark.filterwarnings("ignore:.*treespec, LeafSpec:FutureWarning")
 def test_models_are_measured_once_and_drawn(tmp_path: Path) -> None:
     lines = list[str]()
@@ -63,9 +65,8 @@ def test_models_are_measured_once_and_drawn(tmp_path: Path) -> None:
 
     kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("calibration-*.json")}
     assert len(kept) == len(MODELS)
-    plain = model_options("transformer", TINY)
-    suite = build_suite("hopper-medium", tmp_path, TINY, progress=False)
-    add_model(suite, "certain", replace(plain, epistemic="none"), progress=False)
+    plain, made = suite.model_options("transformer", TINY), build_suite("hopper-medium", tmp_path, TINY, progress=False)
+    add_model(made, "certain", replace(plain, epistemic="none"), progress=False)
     again = run("again.json", others={"certain": str(tmp_path / "{task}/models/certain")})
     assert numbers.items() <= again.items()  # the seconds, too: nothing was measured again
     assert kept == {path: path.stat().st_mtime_ns for path in kept}

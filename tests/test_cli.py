@@ -86,7 +86,10 @@ def test_names_that_the_command_line_writes_out_itself_are_all_there_are(
     [
         (["--help"], ["torch", "lightning", "jsonargparse", "numpy", "rich"]),
         (["zoo", "--help"], ["torch", "lightning", "jsonargparse", "numpy", "rich"]),
-        *(([*command.split(), "--help"], ["torch", "lightning", "numpy"]) for command in ("horizon", "zoo build")),
+        *(
+            ([*command.split(), "--help"], ["torch", "lightning", "numpy"])
+            for command in ("horizon", "zoo build", "train_model", "evaluate")
+        ),
     ],
 )
 def test_help_imports_nothing_slow(arguments: list[str], absent: list[str]) -> None:

@@ -8,8 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ from envtf_lit.cli import main, project
 
 def doctor():
     with concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        waiting = pool.submit(time.sleep, 60)
+        waiting = pool.submit(time.sleep, 600)
         while not waiting.running():
             time.sleep(0.01)
         print("ready", flush=True)
@@ -74,7 +74,7 @@ def test_a_pool_does_not_hold_up_a_termination(tmp_path: Path) -> None:
     )
     assert process.stdout is not None and process.stdout.readline() == "ready\n"
     process.terminate()
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=120)
     assert process.returncode == 143
     assert "envtf: Interrupted. The same command begins anew." in errors.splitlines()
 
@@ -229,13 +229,15 @@ def test_lightnings_help_says_that_a_config_is_trusted(kind: str, capsys: pytest
     assert "trusted like code" in " ".join(capsys.readouterr().out.split())
 
 
-def test_lightnings_command_lines_refuse_bad_input_alike(project: Path) -> None:
-    output = run(project, "model", "fit", "--data.path", "nowhere.h5", expected=2)
-    assert "envtf: nowhere.h5" in output.splitlines()[-1]
-    assert "Traceback" not in output
-
-
 # Lightning 2.6's use of an older jsonargparse's names
+@pytest.mark.filterwarnings("ignore::jsonargparse._deprecated.JsonargparseDeprecationWarning")
+def test_lightnings_command_lines_refuse_bad_input_alike(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(["model", "fit", "--data.path", "nowhere.h5"]) == 2
+    said = capsys.readouterr()
+    assert "envtf: nowhere.h5" in said.err.splitlines()[-1]
+    assert "Traceback" not in said.out + said.err
+
+
 @pytest.mark.filterwarnings("ignore::jsonargparse._deprecated.JsonargparseDeprecationWarning")
 def test_a_disk_that_is_full_of_checkpoints_is_said_in_a_sentence(
     tiny_download: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -244,6 +246,7 @@ def test_a_disk_that_is_full_of_checkpoints_is_said_in_a_sentence(
     sizes = {"layers": 1, "width": 16, "context": 4, "updates_per_epoch": 2, "updates": 2}
     options = [f"--model.options.{key}={value}" for key, value in sizes.items()]
     fit = ["model", "fit", "--data.path", str(tiny_download / "data/dataset.h5"), "--trainer.logger=false", *options]
+    import_module("envtf_lit.cli.lightning")  # Python's own files of bytecode are larger, too
     with full_disk(4_000):
         assert exit_status(fit) == 2
     said = capsys.readouterr().err.splitlines()[-1]
@@ -259,12 +262,10 @@ def test_a_rendering_back_end_that_is_not_there_stops_neither_stage_nor_doctor(p
     assert "MUJOCO_GL        glut" in report and "rendering " in report
 
 
-def run(
-    folder: Path, *arguments: str, expected: int = 0, program: Sequence[str] = ("-m", "envtf_lit"), **variables: str
-) -> str:
+def run(folder: Path, *arguments: str, **variables: str) -> str:
     """Runs `envtf` in a process of its own and returns all that it printed."""
     result = subprocess.run(
-        [sys.executable, *program, *arguments],
+        [sys.executable, "-m", "envtf_lit", *arguments],
         cwd=folder,
         env=os.environ | variables,
         stdout=subprocess.PIPE,
@@ -272,5 +273,5 @@ def run(
         text=True,
         check=False,
     )
-    assert result.returncode == expected, result.stdout
+    assert result.returncode == 0, result.stdout
     return result.stdout

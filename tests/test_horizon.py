@@ -54,7 +54,7 @@ def run(folder: Path, lines: list[str], measured: HorizonOptions = FEW, **option
     return run_study(HorizonStudy(measured), folder / "out/horizon.json", report=lines.append, **facts | options)
 
 
-@pytest.mark.usefixtures("short_episodes")
+@pytest.mark.usefixtures("small_models", "short_episodes")
 def test_every_model_is_measured_once_and_all_of_it_is_written(tmp_path: Path) -> None:
     lines = list[str]()
     numbers = run(tmp_path, lines)
@@ -88,7 +88,7 @@ def test_every_model_is_measured_once_and_all_of_it_is_written(tmp_path: Path) -
     assert kept == {path: path.stat().st_mtime_ns for path in kept}
 
 
-@pytest.mark.usefixtures("short_episodes")
+@pytest.mark.usefixtures("small_models", "short_episodes")
 def test_a_policy_whose_episodes_all_end_before_the_start_is_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -104,7 +104,7 @@ def test_a_policy_whose_episodes_all_end_before_the_start_is_left_out(
     assert set(pd.read_csv(tmp_path / "out/horizon/online.csv")["source"]) == {"medium", "expert"}
 
 
-@pytest.mark.usefixtures("short_episodes")
+@pytest.mark.usefixtures("small_models", "short_episodes")
 def test_what_was_measured_is_written_before_the_next_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def build(task: str, *arguments: Any, **options: Any) -> Suite:
         if task != "hopper-medium":
@@ -137,7 +137,7 @@ def test_what_cannot_be_measured_is_refused_before_any_work(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("short_episodes")
+@pytest.mark.usefixtures("small_models", "short_episodes")
 def test_variants_are_trained_and_measured_beside_the_suite(tmp_path: Path) -> None:
     out, names = tmp_path / "ablation.json", ["context_8", "updates_x2"]
     options = replace(TINY, context=16)
