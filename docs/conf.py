@@ -26,6 +26,7 @@ suppress_warnings = ["etoc.glob"]  # of tutorials, where none was executed
 default_role = "code"  # docstrings put code in single backticks
 autodoc_default_options = {"members": True}
 autodoc_inherit_docstrings = False  # Lightning's are not ours
+autodoc_mock_imports = ["ray", "sbx"]  # of extras that the site does without
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 python_maximum_signature_line_length = 88

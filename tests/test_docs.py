@@ -63,6 +63,22 @@ def test_addresses_elsewhere_are_whole() -> None:
     assert odd == []
 
 
+def test_every_module_of_a_room_in_the_api_reference_is_there() -> None:
+    pages = {
+        path.stem: re.findall(r"automodule:: envtf_lit\.(\S+)", path.read_text()) for path in DOCS.glob("api/*.rst")
+    }
+    documented = [name for names in pages.values() for name in names]
+    rooms = [ROOT / "envtf_lit" / name for name in pages if (ROOT / "envtf_lit" / name).is_dir()]
+    modules = {
+        ".".join(path.relative_to(ROOT / "envtf_lit").with_suffix("").parts)
+        for room in rooms
+        for path in room.rglob("*.py")
+    }
+    assert len(rooms) > 8
+    assert {name for name in modules if not name.endswith("__init__")} - set(documented) == set()
+    assert len(documented) == len(set(documented))
+
+
 def test_the_readme_has_a_line_for_every_room_of_the_package() -> None:
     named = re.findall(r"^  (\w+)/ +\w", (ROOT / "README.md").read_text(), re.MULTILINE)
     rooms = {path.parent.name for path in (ROOT / "envtf_lit").glob("*/__init__.py")}
