@@ -25,6 +25,7 @@ SPREADS = pd.DataFrame({"predicted": [0.1, 0.5], "observed": [0.2, 0.4]})
 QUARTILES = {"lower": [0.1, 0.1], "median": [0.2, 0.3], "upper": [0.4, 0.5]}
 STEPS = pd.DataFrame({"step": [1, 2], **QUARTILES, "running": [1, 0.5]})
 NOVELTIES = {"in": np.array([0.1, 0.5]), "out": np.array([2.0, 9.0])}
+WALK = np.asarray(walker_dataset(1).observations)
 MATRIX = np.array([[0.5, -np.inf], [1, 2]])
 PROMISES = pd.DataFrame({"speed": [2.0, 3.0], "promised": [1.0, 2.0], "true": [1.0, -50.0], "halted": [0.0, 0.9]})
 LOGS = {"whole": linear_data((30, 40)), "part": linear_data((20,))}
@@ -49,7 +50,7 @@ PICTURES: dict[str, Callable[[Path], object]] = {
     "maps": lambda path: attention.attention_maps(np.full((2, 2, 6, 6), 0.2), path),
     "matrices": lambda path: attention.small_matrices([("m", MATRIX)], path, ticks=["a", "b"]),
     "novelty": lambda path: uncertainty.novelty_over_states(GRID, np.zeros((5, 11)), (0, 5), "hopper", path),
-    "film": lambda path: film.film_strip({"real": walker_dataset(1).observations}, HOPPER, [0, 9], path, title="t"),
+    "film": lambda path: film.film_strip({"real": WALK}, HOPPER, [0, 9], path, title="t"),
 }
 
 
@@ -89,9 +90,9 @@ def test_objectives_are_least_where_their_dots_are() -> None:
 
 
 def test_a_film_has_no_picture_of_what_is_over_or_not_finite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    long, lost = walker_dataset(1).observations, walker_dataset(1).observations.copy()
+    lost = WALK.copy()
     lost[5:] = np.nan
-    strips = {"long": long, "short": long[:6], "lost": lost}
+    strips = {"long": WALK, "short": WALK[:6], "lost": lost}
     with caught(monkeypatch) as figures:
         film.film_strip(strips, HOPPER, [0, 4, 9], tmp_path / "f.png", title="three")
     shown = [len(axis.images) for axis in figures[0].axes]

@@ -24,10 +24,10 @@ def expected_loss(objective: Objective, error: float, spread: np.ndarray) -> np.
     off = torch.full_like(log_variance, error)
     if objective == "nll":
         return nll(off, log_variance, torch.zeros_like(off)).numpy()
-    many = [column.expand(DRAWS, *column.shape) for column in (off, log_variance)]
-    nothing = torch.full_like(many[0], -np.inf)
+    mean, spreads = (column.expand(DRAWS, *column.shape) for column in (off, log_variance))
     drawn = torch.Generator().manual_seed(0)
-    return paper_mse(*many, nothing, torch.zeros_like(many[0]), generator=drawn).mean(0).numpy()
+    no_epistemic = torch.full_like(mean, -np.inf)
+    return paper_mse(mean, spreads, no_epistemic, torch.zeros_like(mean), generator=drawn).mean(0).numpy()
 
 
 def best_spread(objective: Objective, error: float) -> float:

@@ -1,6 +1,7 @@
 """A machine that was held back: a log that a speed governor kept slow, and what awaits whoever goes faster."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -47,7 +48,7 @@ class Governed:
 
 
 def held_back_log(episodes: int, *, seed: int) -> OfflineDataset:
-    """A log of nearly equal episodes of 1,000 steps, at about 3 m/s, as a governor of 2.5 m/s lets through.
+    """A log of nearly equal episodes of 1,000 steps at about 3 m/s, for the governor never brakes.
 
     It never shows what a higher speed costs.
 
@@ -55,7 +56,7 @@ def held_back_log(episodes: int, *, seed: int) -> OfflineDataset:
         episodes: at least 2.
         seed: of the robot's starts and of the noise.
     """
-    columns = _play(RECORDED_SPEED, episodes, seed=seed, noise=NOISE)
+    columns: dict[str, Any] = {**_play(RECORDED_SPEED, episodes, seed=seed, noise=NOISE)}
     limit = np.ones(ROBOT.action_dim, np.float32)
     starts = starts_from_ends(columns["terminated"] | columns["truncated"])
     return OfflineDataset(**columns, episode_starts=starts, action_low=-limit, action_high=limit)
@@ -82,12 +83,23 @@ def promises(
     begin = BranchPoints(log).draw(starts, 16, torch.Generator().manual_seed(seed))
     rows = []
     for speed in speeds:
-        how = dict(horizon=0, expansion=steps, terminated=never_terminated)
-        run = imagine(model, Governed(speed), begin, **how)
-        halted = imagine(model, Governed(speed), begin, novelty_limit=1.0, **how).halted.any(0)
+        run, cut = (
+            imagine(
+                model,
+                Governed(speed),
+                begin,
+                horizon=0,
+                expansion=steps,
+                terminated=never_terminated,
+                novelty_limit=limit,
+            )
+            for limit in (None, 1.0)
+        )
         played = _play(speed, 1, seed=seed + 1)
         true = np.where(played["next_observations"][:, SPEED] > fastest, PUNISHMENT, played["rewards"])
-        rows.append((speed, float(run.rewards[run.valid].mean()), float(true.mean()), float(halted.double().mean())))
+        rows.append(
+            (speed, float(run.rewards[run.valid].mean()), float(true.mean()), float(cut.halted.any(0).double().mean()))
+        )
     return pd.DataFrame(rows, columns=["speed", "promised", "true", "halted"])
 
 
