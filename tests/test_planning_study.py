@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +13,15 @@ from PIL import Image
 
 from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.cli.main import main
+from envtf_lit.critics import Critics, load_critics, save_critics
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.evaluation.planning import score_planner
+from envtf_lit.evaluation.planning import planner_of, score_planner
+from envtf_lit.planning.objective import imagined_paths
 from envtf_lit.policy import save_policy
 from envtf_lit.robots.tasks import ROBOTS
 from envtf_lit.studies.planning import FAMILIES, PlanningOptions, planning_table, run_planning
-from envtf_lit.world_models.store import save_world_model
+from envtf_lit.world_models.store import load_world_model, save_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.logs import dataset_of_chains
 from tests.test_planning import SMALL
@@ -52,6 +55,49 @@ def test_envtf_plan_plays_a_planner_beside_its_prior(
     found = json.loads(out.read_text())
     assert found["options"] == ["horizon=3", "samples=8"] and found["decisions_per_second"] > 1
     assert len(found["returns"]) == len(found["prior_returns"]) == 1
+
+
+@pytest.fixture
+def judged(hopper_model: Path, tmp_path: Path) -> Path:
+    """The policy's folder, with critics of another discount than the planner's own."""
+    shutil.copytree(hopper_model / "policy", tmp_path / "judged")
+    save_critics(tmp_path / "judged", Critics(11, 3, n=2, hidden=(8,), layer_norm=False, discount=0.9))
+    return tmp_path / "judged"
+
+
+@pytest.mark.parametrize(
+    ("words", "discount", "critics"),
+    [([], 0.9, True), (["--option", "discount=0.5"], 0.5, True), (["--no-critics"], 0.99, False)],
+)
+def test_the_policys_critics_judge_what_follows_a_plan(
+    words: list[str],
+    discount: float,
+    critics: bool,
+    hopper_model: Path,
+    judged: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    out = tmp_path / "plan.json"
+    main(envtf_plan(hopper_model, "--policy", str(judged), "--out", str(out), *words))
+    found, said = json.loads(out.read_text()), capsys.readouterr().out
+    assert (found["discount"], found["critics"]) == (discount, critics)
+    assert f"discount {discount:g}." in said and ("critics judge what follows a plan" in said) == critics
+
+
+def test_a_plan_is_worth_what_it_pays_and_the_value_of_its_end(hopper_model: Path, judged: Path):
+    model, critics = load_world_model(hopper_model / "model"), load_critics(judged)
+    words = ["horizon=3", "samples=8"]
+    planner = planner_of("mppi", model, ROBOTS["hopper"], words, prior=critics.policy, critics=critics)
+    observation = torch.zeros(2, 11) + torch.tensor([1.25] + [0.0] * 10)
+    found = planner.search(observation)
+    plans = planner.scaled(found.candidates)
+    paths = imagined_paths(model, planner.state, plans)
+    stands = ~ROBOTS["hopper"].terminated(paths[:, :, 1:]).any(-1)
+    end = torch.where(stands, critics.value(paths[:, :, -1].flatten(0, 1)).view(2, -1), 0.0)
+    paid = planner_of("mppi", model, ROBOTS["hopper"], [*words, "discount=0.9"])
+    torch.testing.assert_close(found.returns, paid.objective.returns(planner.state, plans) + 0.9**3 * end)
+    assert stands.any() and not stands.all()
 
 
 @pytest.mark.parametrize(

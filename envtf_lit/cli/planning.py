@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from envtf_lit.cli.output import console, hush_lightning
 from envtf_lit.cli.signatures import CORES, File, Folder, Natural, Positive, run_command
@@ -21,6 +21,7 @@ def plan(
     task: Annotated[str, "TASK"],
     planner: Literal["random", "cem", "icem", "mppi", "gradient"] = "mppi",
     policy: Folder | None = None,
+    no_critics: bool = False,
     option: Options = (),
     episodes: Positive = 1,
     steps: Positive | None = None,
@@ -38,7 +39,9 @@ def plan(
         world_model: that it plans through.
         task: whose robot acts, such as hopper-medium.
         planner: family.
-        policy: whose plan the search begins at; it is played beside the planner.
+        policy: whose plan the search begins at, and whose critics, where its folder has some, judge what follows a
+            plan, with their own discount; it is played beside the planner.
+        no_critics: nothing follows a plan, whatever the policy's folder has.
         option: of the planner, such as horizon=20; may be repeated.
         episodes: of each.
         steps: of an episode at most; default: the robot's 1000.
@@ -66,8 +69,16 @@ def plan(
         claim(out, "decisions_per_second")
     torch.set_num_threads(threads)
     robot = get_task(task).robot
-    played = dict(policy=policy, episodes=episodes, steps=steps, seed=seed, precision=precision, progress=not quiet)
-    found = score_planner(world_model, robot, planner, option, **played)  # pyright: ignore[reportArgumentType]
+    played: dict[str, Any] = dict(
+        policy=policy,
+        critics=not no_critics,
+        episodes=episodes,
+        steps=steps,
+        seed=seed,
+        precision=precision,
+        progress=not quiet,
+    )
+    found = score_planner(world_model, robot, planner, option, **played)
     _print_scores(found, planner, policy)
     if out is not None:
         asked = dict(task=task, planner=planner, options=list(option), seed=seed, threads=threads, precision=precision)
@@ -79,7 +90,7 @@ def plan(
 def _rates(found: "PlannedReturns") -> dict[str, object]:
     prior = {} if found.prior is None else {"prior_returns": found.prior.returns.tolist()}
     rates = {"returns": found.planned.returns.tolist(), "decisions_per_second": found.decisions_per_second}
-    return rates | prior
+    return rates | {"discount": found.discount, "critics": found.valued} | prior
 
 
 def _print_scores(found: "PlannedReturns", planner: str, policy: Path | None) -> None:
@@ -92,6 +103,8 @@ def _print_scores(found: "PlannedReturns", planner: str, policy: Path | None) ->
             row = played.returns.mean(), played.scores.mean(), played.lengths.mean()
             table.add_row(name, f"{row[0]:.1f}", f"{row[1]:.1f}", f"{row[2]:.0f}", speed)
     console().print(table, soft_wrap=False)
+    after = f"{policy}'s critics judge what follows a plan" if found.valued else "Nothing follows a plan"
+    console().print(f"{after}; discount {found.discount:g}.")
 
 
 def _draw(found: "PlannedReturns", world_model: Path, robot: "Robot", dataset: Path, video: Path) -> None:

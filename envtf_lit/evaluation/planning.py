@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from envtf_lit.critics import CRITICS, PolicyCritics, load_critics
 from envtf_lit.errors import UserError
 from envtf_lit.options.schema import Precision, build
 from envtf_lit.planning.planner import Planner
@@ -30,11 +31,15 @@ class PlannedReturns:
         planned: its episodes.
         decisions_per_second: for one episode alone, if there was one; else for all of them together.
         prior: the prior's own episodes from the same seeds; None without one.
+        discount: of the planner, per step.
+        valued: whether the prior's critics judged what follows a plan.
     """
 
     planned: Returns
     decisions_per_second: float
     prior: Returns | None
+    discount: float
+    valued: bool
 
 
 class Timed:
@@ -61,7 +66,14 @@ class Timed:
 
 
 def planner_of(
-    name: str, model: WorldModel, robot: Robot, words: Sequence[str] = (), *, prior: Policy | None = None, seed: int = 0
+    name: str,
+    model: WorldModel,
+    robot: Robot,
+    words: Sequence[str] = (),
+    *,
+    prior: Policy | None = None,
+    critics: PolicyCritics | None = None,
+    seed: int = 0,
 ) -> Planner[Any]:
     """The planner of that name for a robot.
 
@@ -71,6 +83,7 @@ def planner_of(
         robot: whose rule ends plans, and whose action range is searched.
         words: its options that are not the default, such as `horizon=20`.
         prior: see `Planner`.
+        critics: whose value ends plans; their discount is the planner's, unless `words` say otherwise.
         seed: of everything random.
 
     Raises:
@@ -83,8 +96,11 @@ def planner_of(
             "was trained on this robot."
         )
     cls, limit = PLANNERS[name], [robot.action_limit] * robot.action_dim
-    options = build(cls.Options, dict(_assignment(word) for word in words), "")
-    return cls(model, [-x for x in limit], limit, options, terminated=robot.terminated, prior=prior, seed=seed)
+    common = {} if critics is None else {"discount": critics.critics.discount}
+    options = build(cls.Options, common | dict(_assignment(word) for word in words), "")
+    value = None if critics is None else critics.value
+    further = dict(terminated=robot.terminated, value=value, prior=prior, seed=seed)
+    return cls(model, [-x for x in limit], limit, options, **further)  # pyright: ignore[reportArgumentType]
 
 
 def _assignment(word: str) -> tuple[str, Any]:
@@ -105,6 +121,7 @@ def score_planner(
     words: Sequence[str] = (),
     *,
     policy: Path | None = None,
+    critics: bool = True,
     episodes: int,
     steps: int | None = None,
     seed: int,
@@ -118,6 +135,7 @@ def score_planner(
         robot: whose simulator is played in.
         planner, words: as of `planner_of`.
         policy: folder of the prior; None plans without one.
+        critics: the prior's value of a plan's last state counts, where the folder has critics.
         episodes: of each.
         steps: of an episode at most; None: as many as the robot's episodes have.
         seed: of the episodes and the planner.
@@ -128,17 +146,19 @@ def score_planner(
         UserError: as of `planner_of`, or a folder that holds no world model or no policy of this robot.
     """
     model = load_world_model(world_model)
-    prior = None if policy is None else load_policy(policy)
+    prior = None if policy is None else load_policy(policy, guarded=False)  # it acts in imagined states, too
     if prior is not None and len(prior.observation_mean) != robot.observation_dim:
         raise UserError(
             f"{policy} holds a policy of observations of size {len(prior.observation_mean)}, and {robot.name} has "
             f"{robot.observation_dim}: take one that was trained on this robot."
         )
-    timed = Timed(planner_of(planner, model, robot, words, prior=prior, seed=seed))
+    judging = load_critics(policy) if critics and policy is not None and (policy / CRITICS).is_dir() else None
+    timed = Timed(planner_of(planner, model, robot, words, prior=prior, critics=judging, seed=seed))
     body = robot if steps is None else replace(robot, max_episode_steps=steps)
     with autocast(torch.device("cpu"), precision):
         found = evaluate_policy(timed, body, episodes=episodes, seed=seed, progress=progress)
     beside = None
     if prior is not None:
         beside = evaluate_policy(prior, body, episodes=episodes, seed=seed, progress=progress)
-    return PlannedReturns(found, timed.decisions / timed.seconds, beside)
+    rate, discount = timed.decisions / timed.seconds, timed.planner.options.discount
+    return PlannedReturns(found, rate, beside, discount, judging is not None)
