@@ -1,4 +1,4 @@
-"""Planners: beside Riccati's optimum and pytorch-mppi, their memory, their caution, and what they refuse."""
+"""Planners: beside Riccati's optimum and pytorch-mppi, their memory, and their caution."""
 
 from dataclasses import replace
 from functools import cache
@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from envtf_lit.actors import TanhGaussianActor
-from envtf_lit.errors import UserError
 from envtf_lit.planning.noise import coloured_noise
 from envtf_lit.planning.objective import Objective, imagined_paths
 from envtf_lit.planning.options import (
@@ -22,13 +21,13 @@ from envtf_lit.planning.options import (
     RandomShootingOptions,
 )
 from envtf_lit.planning.registry import PLANNERS
-from envtf_lit.planning.shooting import CEM, MPPI, RandomShooting
+from envtf_lit.planning.shooting import CEM, MPPI
 from envtf_lit.policy import StatefulPolicy
 from envtf_lit.robots.returns import evaluate_policy
 from envtf_lit.robots.tasks import ROBOTS
 from envtf_lit.world_models.interface import Prediction
 from envtf_lit.world_models.transformer import EnvironmentTransformer
-from tests.analytic import LinearWorld, linear_world
+from tests.analytic import LinearWorld
 
 # a double integrator, whose cost s'Qs + 0.1 a^2 has a known optimum
 
@@ -309,43 +308,3 @@ def test_evaluation_takes_a_planner_and_lets_it_begin_anew():
     planner = CEM(model.requires_grad_(False), [-1.0] * 3, [1.0] * 3, SMALL["cem"])  # pyright: ignore[reportArgumentType]
     first, second = (evaluate_policy(planner, robot, episodes=2, seed=0, progress=False) for _ in range(2))
     assert first.returns.tolist() == second.returns.tolist() and first.lengths.tolist() == [3, 3]
-
-
-# what is refused
-
-
-def refused(words: str, **given: Any) -> None:
-    arguments: dict[str, Any] = dict(model=linear_world(), action_low=[-1.0], action_high=[1.0]) | given
-    with pytest.raises(UserError, match=words):
-        RandomShooting(**arguments)
-
-
-def test_bad_input_ends_in_one_sentence():
-    refused("horizon is 0, expected an integer, more than 0", options=RandomShootingOptions(horizon=0))
-    refused("tail is 3.*there is none", options=RandomShootingOptions(tail=3))
-    refused("discount is 2", options=RandomShootingOptions(discount=2.0))
-    refused("2 low and 2 high limits.*actions of size 1", action_low=[-1.0] * 2, action_high=[1.0] * 2)
-    refused("finite range", action_high=[float("inf")])
-    with pytest.raises(UserError, match="elites is 20 and samples is 10"):
-        CEMOptions(samples=10, elites=20)
-    with pytest.raises(UserError, match=r"decay is 0\.5"):
-        ICEMOptions(decay=0.5)
-
-
-def test_a_planner_refuses_observations_that_are_none_of_its_episodes():
-    planner = RandomShooting(linear_world(), [-1.0], [1.0], RandomShootingOptions(samples=4))
-    with pytest.raises(UserError, match=r"observations of size 3.*shape \(2, 5\)"):
-        planner.act(torch.zeros(2, 5))
-    planner.act(torch.zeros(2, 3))
-    with pytest.raises(UserError, match="follows 2 episodes and was given 3"):
-        planner.act(torch.zeros(3, 3))
-    planner.reset()
-    assert planner.act(torch.zeros(3, 3)).shape == (3, 1)
-
-
-def test_a_planner_says_what_it_lacks():
-    world, options = linear_world(), RandomShootingOptions(samples=4)
-    with pytest.raises(UserError, match="No plan from observation 1 has a finite return"):
-        RandomShooting(world, [-1.0], [1.0], options).act(torch.tensor([[0.0] * 3, [float("nan")] * 3]))
-    with pytest.raises(UserError, match="no epistemic variance"):
-        RandomShooting(world, [-1.0], [1.0], replace(options, novelty_limit=1.0)).act(torch.zeros(1, 3))

@@ -17,6 +17,8 @@ from envtf_lit.robots.termination import never_terminated
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.unroll import unroll
 
+ROUNDING = 0.02  # of a reward that is always the same, within which a trained model predicts it
+
 Own = TypeVar("Own", bound=PlannerOptions)
 
 
@@ -118,8 +120,8 @@ class Planner(ABC, Generic[Own]):
             generator: of the candidates; None takes the planner's own, which begins anew at `reset`.
 
         Raises:
-            UserError: another number or size of observations, a state that no candidate leaves with a finite return, or
-                a novelty limit where the model has no epistemic variance.
+            UserError: another number or size of observations, a state that no candidate leaves with a finite return, a
+                novelty limit where the model has no epistemic variance, or nothing to choose plans by.
         """
         generator = self._own_generator(observation.device) if generator is None else generator
         found = self.search(observation, generator)
@@ -144,9 +146,24 @@ class Planner(ABC, Generic[Own]):
             raise UserError(
                 f"No plan from observation {row} has a finite return, so there is nothing to choose by: the world "
                 "model's predictions, or the reward or value given, are not finite there; train the model with "
-                "bounded: true, or plan fewer steps."
+                "bounded: true, plan fewer steps, or give a reward if the model has none."
             )
+        self._check_reward(found.returns)
         return found
+
+    def _check_reward(self, returns: Tensor) -> None:
+        """Refuses to choose by returns (B, N) that are all what a log of equal rewards taught the model to predict."""
+        judge, o = self.objective, self.options
+        constant = getattr(getattr(self.model, "normaliser", None), "constant_reward", None)
+        lives = constant != 0 and judge.terminated is not never_terminated  # it is paid for as long as it stands
+        if constant is None or lives or judge.reward is not None or judge.value is not None:
+            return
+        steps = sum(o.discount**t for t in range(o.horizon + o.tail))
+        if ((returns - constant * steps).abs() <= ROUNDING * (abs(constant) or 1.0) * steps).all():
+            raise UserError(
+                f"The world model's log pays {constant:g} at every step, so that no plan is better than another: give "
+                "the planner a reward or a value, or train the model on a log that has rewards."
+            )
 
     @property
     def state(self) -> Any:

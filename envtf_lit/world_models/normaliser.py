@@ -1,5 +1,7 @@
 """The z-scoring of a world model's inputs and targets: buffers of the model, saved with it."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -54,6 +56,15 @@ class Normaliser(nn.Module):
             low, high = data.outcomes.low.float(), data.outcomes.high.float()
             self.outcome_low.copy_(low - MARGIN * (high - low))
             self.outcome_high.copy_(high + MARGIN * (high - low))
+
+    @property
+    def constant_reward(self) -> float | None:
+        """The reward of every training row, where the scale is that of rewards which are all alike; else None.
+
+        Rewards of which one half is 0 and the other 1 have the scale of ones that are all a half: predictions tell.
+        """
+        mean, std = float(self.target_mean[-1]), float(self.target_std[-1])
+        return mean if math.isclose(std, abs(mean) or 1.0, rel_tol=1e-6) else None
 
     def input_scale(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of what `token` z-scores, each (S + A,)."""
