@@ -28,6 +28,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 # modules that need more than the library's own dependencies
 NEED = {
+    "envtf_lit/comparison/cluster.py": "cluster",
     "envtf_lit/data/sources/parquet.py": "parquet",
     "envtf_lit/export.py": "export",
     "envtf_lit/figures/inline.py": "pipeline",
@@ -185,11 +186,11 @@ def test_init_says_how_to_get_dvc(
 WITHOUT_EXTRAS = """
 import sys
 names = "dvc dvclive IPython ipykernel jinja2 jupyter_client nbconvert nbformat onnx onnxruntime onnxscript papermill "
-names += "pyarrow sbx tensorboard"
+names += "pyarrow ray sbx tensorboard"
 for name in names.split():
     sys.modules[name] = None
 import envtf_lit.pipeline.evaluate, envtf_lit.pipeline.train_policy, envtf_lit.cli.lightning
-import envtf_lit.zoo.build, envtf_lit.studies.horizon
+import envtf_lit.zoo.build, envtf_lit.studies.horizon, envtf_lit.comparison.runner
 print(envtf_lit.load_dataset, envtf_lit.load_policy, envtf_lit.load_world_model)
 """
 
