@@ -8,7 +8,7 @@ from envtf_lit.agents.options import NO_WORLD_MODEL, PolicyOptions
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.comparison.budgets import Budget, epoch_of
 from envtf_lit.comparison.grid import Cell
-from envtf_lit.data.loaders import UPDATES_PER_STEP
+from envtf_lit.data.options import UPDATES_PER_STEP
 from envtf_lit.options.schema import build
 from envtf_lit.pipeline.params import Params, build_params
 from envtf_lit.pipeline.published import published_options
