@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -9,8 +10,20 @@ from torch import Tensor, nn
 from envtf_lit.errors import UserError
 
 CURES = {"": "lower learning_rate, or look for outliers with `envtf data check`"}  # where a module has none of its own
-EXPLODED = 1e4  # a mean loss over z-scored targets, where a model that knows nothing has about 1
 OVERFLOW = "so a value, a loss or a gradient has overflowed"
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What a logged metric of a sound training stays below.
+
+    Attributes:
+        largest: value.
+        cause: a clause on a larger one.
+    """
+
+    largest: float
+    cause: str
 
 
 def diverged(
@@ -23,29 +36,37 @@ def diverged(
         when: such as `in epoch 3`.
         name, value: what shows it.
         cause: a clause on the value.
-        cures: the likeliest two, by the name; `` for all others.
+        cures: the likeliest two, by the name without its split; `` for all others.
         epoch: from 1; there is a checkpoint of the one before, if there was one.
     """
     kept = "" if epoch == 1 else " The epoch before is kept in the run's last checkpoint."
-    return UserError(f"{label} diverged {when}: {name} is {value:.3g}, {cause}; {cures.get(name, cures[''])}.{kept}")
+    cure = cures.get(name.rpartition("/")[2], cures[""])
+    return UserError(f"{label} diverged {when}: {name} is {value:.3g}, {cause}; {cure}.{kept}")
 
 
 def check_epoch(
-    metrics: Mapping[str, Tensor], module: nn.Module, label: str, epoch: int, cures: Mapping[str, str]
+    metrics: Mapping[str, Tensor],
+    module: nn.Module,
+    label: str,
+    epoch: int,
+    *,
+    cures: Mapping[str, str] = CURES,
+    bounds: Mapping[str, Bound] | None = None,
 ) -> None:
     """Refuses an epoch that diverged: before its checkpoint is written, so that the one before stays.
 
     One look at the device for all weights, once an epoch.
 
     Args:
-        metrics: scalars that the epoch logged, by their whole names; `train/loss` is a mean over z-scored targets.
+        metrics: scalars that the epoch logged, by their whole names, such as `train/loss`.
         module: what is trained.
         label: of it.
         epoch: from 1.
         cures: see `diverged`.
+        bounds: of some metrics.
 
     Raises:
-        UserError: a metric or a weight is not finite, or the loss has exploded.
+        UserError: a metric or a weight is not finite, or a metric is beyond its bound.
     """
     names = [f"the norm of {name}" for name, _ in module.named_parameters()]
     norms = torch.stack([parameter.detach().float().norm() for parameter in module.parameters()]).tolist()
@@ -53,9 +74,9 @@ def check_epoch(
     for name, value in values.items():
         if not math.isfinite(value):
             raise diverged(label, f"in epoch {epoch}", name, value, OVERFLOW, cures, epoch=epoch)
-    if (loss := values.get("train/loss", 0.0)) > EXPLODED:
-        cause = "and a model that knows nothing has about 1"
-        raise diverged(label, f"in epoch {epoch}", "train/loss", loss, cause, cures, epoch=epoch)
+    for name, bound in (bounds or {}).items():
+        if values.get(name, 0.0) > bound.largest:
+            raise diverged(label, f"in epoch {epoch}", name, values[name], bound.cause, cures, epoch=epoch)
 
 
 def unsound(tensors: Mapping[str, Tensor], parameters: Collection[str]) -> tuple[str, float] | None:

@@ -1,6 +1,7 @@
 """Files and folders that are whole or absent, whatever happens while they are written."""
 
 import contextlib
+import csv
 import errno
 import functools
 import hashlib
@@ -12,7 +13,7 @@ import shutil
 import stat
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -287,3 +288,12 @@ def read_json(path: str | Path) -> Any:
         raise
     except (ValueError, RecursionError) as error:  # the latter of brackets in brackets, the former of a long number too
         raise UserError(f"{path} is not valid JSON ({error}): write it anew.") from None
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes rows as CSV, whole or not at all; what a row lacks is left empty."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    with replacing(path) as temporary, temporary.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, names)
+        writer.writeheader()
+        writer.writerows(rows)

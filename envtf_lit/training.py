@@ -1,7 +1,6 @@
 """One way to train a LightningModule: resumable, quiet or with a progress bar, and leaving nothing half-written."""
 
 import contextlib
-import csv
 import ctypes
 import hashlib
 import io
@@ -20,9 +19,9 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from rich.console import Console
 from torch import nn
 
-from envtf_lit.divergence import CURES, check_epoch
+from envtf_lit.divergence import check_epoch
 from envtf_lit.errors import UserError, did_you_mean
-from envtf_lit.files import check_writable, replacing, write_json
+from envtf_lit.files import check_writable, replacing, write_json, write_table
 from envtf_lit.options.schema import Precision
 
 logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # says what hardware there is at every fit
@@ -72,24 +71,20 @@ class Curves(Checkpoint):
 
     def write(self, path: Path) -> None:
         """Writes the rows as CSV; a metric that an epoch did not log is left empty."""
-        names = dict.fromkeys(name for row in self.rows for name in row)
-        with replacing(path) as temporary, temporary.open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, names)
-            writer.writeheader()
-            writer.writerows(self.rows)
+        write_table(path, self.rows)
 
 
 class Guard(Checkpoint):
     """Stops a training at the end of an epoch that diverged; see `check_epoch`.
 
     A `Checkpoint` by type alone, to be called after the module, and in front of those that write: nothing of that epoch
-    is kept. A module may have a `label`, and `cures` of its own.
+    is kept. A module may have a `label`, and `cures` and `bounds` of its own.
     """
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         label = getattr(pl_module, "label", type(pl_module).__name__)
-        cures = getattr(pl_module, "cures", CURES)
-        check_epoch(trainer.callback_metrics, pl_module, label, trainer.current_epoch + 1, cures)
+        own = {name: getattr(pl_module, name) for name in ("cures", "bounds") if hasattr(pl_module, name)}
+        check_epoch(trainer.callback_metrics, pl_module, label, trainer.current_epoch + 1, **own)
 
 
 class WholeCheckpoints(TorchCheckpointIO):

@@ -5,7 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from envtf_lit.agents.agent import Batch
+from envtf_lit.agents.phases import Batch
+from envtf_lit.agents.value_gradient import ValueGradientOptions
+from envtf_lit.data.loaders import DrawnRows
 from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.imagination.rollouts import Rollouts
@@ -13,18 +15,23 @@ from tests.analytic import linear_data, linear_world
 
 S, A, B = 3, 1, 8
 EPISODES = (30, 40)
+SHORT = ValueGradientOptions(updates=3, rollouts=4, horizon=4)
 
 
 def hand_driven(cls: type[Any], *, source: ImaginedBatches | None = None, action_dim: int = A, **options: Any) -> Any:
     """An agent of 60 updates in epochs of ten, without a warm start unless the options say so, at its first update."""
     torch.manual_seed(0)
     given = dict(updates=60, updates_per_epoch=10, hidden=(16, 16), warm_start=0.0) | options
+    if cls.watches:
+        given = {"critic_updates": 30} | given
     agent: Any = cls(S, action_dim, cls.Options(**given), source=source)
     optimizers = agent.configure_optimizers()
     agent.optimizers = lambda **_: optimizers if len(optimizers) > 1 else optimizers[0]  # as Lightning's
     agent.manual_backward = lambda loss: loss.backward()
     agent.clip_gradients = lambda *_, **__: None
     agent.generator, agent.update_index, agent.clones = torch.Generator().manual_seed(0), 0, True
+    if agent.watches:
+        agent.trust.begin(DrawnRows(linear_data(EPISODES)), 0, torch.device("cpu"))
     return agent
 
 

@@ -16,12 +16,12 @@ from envtf_lit.agents.et_cql import ETCQL, ETCQLPaper
 from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.sac import SAC
 from envtf_lit.errors import UserError
-from tests.hand_driven import B, S, hand_driven, imagining, make_batch
+from tests.hand_driven import SHORT, B, S, hand_driven, imagining, make_batch
 
 A = 2  # actions, where no linear world is in play
 
 
-IMAGINING = [(COMBO, {}), (ETCQLPaper, {}), (ETCQL, {"value_gradient": None})]
+IMAGINING = [(COMBO, {}), (ETCQLPaper, {}), (ETCQL, {"value_gradient": SHORT})]
 
 
 def make_agent(cls: type[Agent] = CQL, **options: Any) -> Any:

@@ -35,10 +35,7 @@ TRANSFORMER = ("et_cql_paper", "et_cql")
 SHORT = {"branches": 8, "horizon": 2}
 OWN: dict[str, dict[str, Any]] = {  # so that each has all its parts in twenty updates
     "rambo": {"warm_start": 0.2, "adversarial_every": 5, "adversarial_updates": 2},
-    "et_cql": {
-        "rollouts": SHORT | {"value_expansion": 1},
-        "value_gradient": {"updates": 5, "rollouts": 4, "horizon": 4},
-    },
+    "et_cql": {"critic_updates": 5, "value_gradient": {"updates": 5, "rollouts": 4, "horizon": 4}},
 }
 
 

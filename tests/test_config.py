@@ -128,7 +128,7 @@ def test_rare_options_are_written_only_where_they_differ(tmp_path: Path) -> None
 
 def test_an_option_that_comes_twice_is_explained_once() -> None:
     lines = re.findall(r"^ *cql_weight: .*$", params_yaml(Params()), re.MULTILINE)
-    assert lines == ["    cql_weight: 0.1  # weight of the conservative term", "    cql_weight: 0.1"]
+    assert lines == ["    cql_weight: 0.1  # weight of the conservative term", "    cql_weight: 0.01"]
 
 
 def test_every_option_is_explained() -> None:
@@ -173,12 +173,12 @@ def test_help_says_types_and_ranges_in_words() -> None:
 
 def test_absent_options_take_their_defaults(tmp_path: Path) -> None:
     params = load(
-        tmp_path, "seed: 3\ntrain_policy: {bc: {algorithm: bc}, x: {algorithm: et_cql, rollouts: {horizon: 2}}}"
+        tmp_path, "seed: 3\ntrain_policy: {bc: {algorithm: bc}, x: {algorithm: et_cql, rollouts: {history: 2}}}"
     )
     assert params.seed == 3
     defaults: Any = Params().train_policy["et_cql"]
     assert params.train_policy["x"] == dataclasses.replace(
-        defaults, rollouts=dataclasses.replace(defaults.rollouts, horizon=2)
+        defaults, rollouts=dataclasses.replace(defaults.rollouts, history=2)
     )
     assert load(tmp_path, "") == Params()
 

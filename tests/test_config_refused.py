@@ -75,7 +75,7 @@ REFUSED = {
     f"train_policy: {{{BC}, x: {{algorithm: et_cql, world_model: trans}}}}": ["is 'trans'", "'transformer'?"],
     f"train_policy: {{{BC}, x: {{algorithm: et_cql, rollouts: null}}}}": ["train_policy.x.rollouts is null"],
     f"train_policy: {{{BC}, x: {{algorithm: et_cql, rollouts: {{horizn: 1}}}}}}": ["'horizn'", "mean 'horizon'?"],
-    f"train_policy: {{{BC}, x: {{algorithm: et_cql, updates: 500}}}}": ["value_gradient.updates is 400", "333"],
+    f"train_policy: {{{BC}, x: {{algorithm: et_cql, updates: 500}}}}": ["value_gradient.updates is 400", "500 updates"],
     f"train_policy: {{{BC}, x: {{algorithm: et_cql, value_gradient: {{horizon: 3}}}}}}": [
         "horizon is 3",
         "history is 4",

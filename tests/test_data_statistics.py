@@ -9,7 +9,7 @@ from walker import walker_dataset
 
 from envtf_lit.data.columns import column_blocks
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import return_weights
+from envtf_lit.data.loaders import ReturnWeights
 from envtf_lit.data.statistics import Moments
 from envtf_lit.evaluation.offline import action_error
 from envtf_lit.world_models import termination_head
@@ -133,7 +133,7 @@ def test_errors_and_weights_have_no_unit(unit: float) -> None:
         scale, episodes = Scale.of(data), whole_episodes(data, 4, seed=0)
         error = nmse(episodes.targets.roll(1, 0), episodes, scale)
         policy_error = torch.tensor(action_error(Echo(), episodes, data))
-        return error, policy_error, scale.live, return_weights(data, 0.5)
+        return error, policy_error, scale.live, ReturnWeights.of(data, 0.5)(data)
 
     for one, two in zip(errors(log()), errors(in_units(log(), unit)), strict=True):
         torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-6)
@@ -141,4 +141,4 @@ def test_errors_and_weights_have_no_unit(unit: float) -> None:
 
 def test_a_log_of_equal_returns_is_drawn_from_evenly() -> None:
     data = replace(log(), rewards=np.ones(len(log()), np.float32))
-    assert len(return_weights(data, 0.5).unique()) == 1
+    assert len(ReturnWeights.of(data, 0.5)(data).unique()) == 1

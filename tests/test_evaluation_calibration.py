@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from analytic import LinearWorld, linear_data, linear_world
-from test_transformer import batch_of, make_model, sequences
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
@@ -27,6 +26,7 @@ from envtf_lit.evaluation.calibration import (
 from envtf_lit.robots.termination import never_terminated
 from envtf_lit.world_models.forecast import Scale, forecast, whole_episodes
 from envtf_lit.world_models.uncertainty.recalibration import normal_scores
+from tests.transformers import batch_of, make_model, sequences
 
 NOISE = 0.05
 

@@ -11,11 +11,11 @@ from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import (
     DrawSampler,
+    ReturnWeights,
     Transitions,
     Windows,
     effective_episodes,
     epoch_generator,
-    return_weights,
 )
 from envtf_lit.data.sources.files import save_dataset
 
@@ -111,7 +111,7 @@ def test_streams_differ(other):
 
 def test_rows_of_better_episodes_are_drawn_more_often():
     dataset = make_dataset()  # episode returns 3, 3 and 30
-    weights = return_weights(dataset, temperature=0.5)
+    weights = ReturnWeights.of(dataset, 0.5)(dataset)
     assert float(weights[4] / weights[0]) == pytest.approx(np.exp(1.0 / 0.5))
     draws = next(iter(DrawSampler(9, (90_000,), 1, seed=0, weights=weights)))
     shares = torch.bincount(draws, minlength=9) / 90_000
@@ -125,19 +125,26 @@ def test_rows_come_from_enough_episodes():
     rewards = np.repeat(rng.normal(size=100), dataset.episode_lengths).astype(np.float32)
     rewards[: dataset.episode_lengths[0]] = 30.0
     dataset = replace(dataset, rewards=rewards)
-    alone = return_weights(dataset, 0.02)
+    alone = ReturnWeights.of(dataset, 0.02)(dataset)
     assert effective_episodes(dataset, alone) < 2.0
     for fewest in (1, 5, 20):
-        held = return_weights(dataset, 0.02, fewest)
+        held = ReturnWeights.of(dataset, 0.02, fewest)(dataset)
         assert effective_episodes(dataset, held) == pytest.approx(
             max(fewest, effective_episodes(dataset, alone)), rel=1e-3
         )
         assert held.argmax() < dataset.episode_lengths[0]  # still the best one's are likeliest
     even = effective_episodes(dataset, torch.ones(len(dataset)))
     assert 80.0 < even < 100.0
-    every = return_weights(dataset, 0.02, 500)
+    every = ReturnWeights.of(dataset, 0.02, 500)(dataset)
     assert effective_episodes(dataset, every) == pytest.approx(even, rel=1e-3)
-    torch.testing.assert_close(return_weights(dataset, 5.0, 20), return_weights(dataset, 5.0))  # there were enough
+    plenty = ReturnWeights.of(dataset, 5.0, 20)
+    assert plenty == ReturnWeights.of(dataset, 5.0)  # there were enough
+
+
+def test_other_episodes_are_weighted_by_the_same_rule():
+    dataset = make_dataset()  # episode returns 3, 3 and 30
+    weights = ReturnWeights.of(dataset, 0.5)
+    torch.testing.assert_close(weights(dataset.select([2, 0])), weights(dataset)[[4, 5, 6, 7, 8, 0, 1, 2]])
 
 
 def test_effective_episodes_count_by_their_share_of_the_rows():

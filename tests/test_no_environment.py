@@ -10,7 +10,7 @@ import torch
 from analytic import linear_data, linear_world
 from made_up_runs import said
 
-from envtf_lit.agents.et_cql import ETCQLOptions
+from envtf_lit.agents.et_cql import ETCQLOptions, GuardedRolloutOptions
 from envtf_lit.agents.value_gradient import ValueGradientOptions
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.options import DownloadOptions
@@ -18,7 +18,6 @@ from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.horizon import horizon_report
 from envtf_lit.evaluation.offline import action_error, evaluate_offline, imagined_returns
-from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.pipeline.download import download
 from envtf_lit.pipeline.evaluate import evaluate
 from envtf_lit.pipeline.generate_rollouts import generate_rollouts
@@ -120,8 +119,8 @@ def own_params(path: Path) -> Params:
     assert isinstance(policies["et_cql"], ETCQLOptions)
     policies["et_cql"] = replace(
         policies["et_cql"],
-        refresh_every=20,
-        rollouts=RolloutOptions(branches=20, horizon=2, value_expansion=2, history=2),
+        critic_updates=15,
+        rollouts=GuardedRolloutOptions(history=2),
         value_gradient=ValueGradientOptions(updates=5, rollouts=5, horizon=3),
     )
     return replace(

@@ -2,25 +2,27 @@
 
 import copy
 import math
-from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
-from envtf_lit.agents.agent import Agent, Losses
+from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.bc import BC
 from envtf_lit.agents.combo import COMBO
 from envtf_lit.agents.cql import CQL
-from envtf_lit.agents.et_cql import ETCQL, ETCQLPaper
+from envtf_lit.agents.et_cql import ETCQL, ETCQLPaper, GuardedRolloutOptions
+from envtf_lit.agents.phases import Losses
 from envtf_lit.agents.sac import SAC
+from envtf_lit.agents.scales import LogReturns
 from envtf_lit.agents.value_gradient import ValueGradientOptions
 from envtf_lit.agents.warm_start import LEARNING_RATE as WARM_RATE
 from envtf_lit.errors import UserError
-from envtf_lit.imagination.options import RolloutOptions
-from tests.hand_driven import B, flat, hand_driven, imagined_batches, imagining, make_batch
+from envtf_lit.training import Guard
+from tests.hand_driven import SHORT, B, flat, hand_driven, imagined_batches, imagining, make_batch
 
-IMAGINING = [(COMBO, {}), (ETCQLPaper, {}), (ETCQL, {"value_gradient": None})]
+IMAGINING = [(COMBO, {}), (ETCQLPaper, {}), (ETCQL, {"value_gradient": SHORT})]
 
 
 def weights(agent: Agent) -> dict[str, torch.Tensor]:
@@ -30,9 +32,9 @@ def weights(agent: Agent) -> dict[str, torch.Tensor]:
 
 def et_cql(warm: int, gradient: int) -> Any:
     """Ten updates: `warm`, the losses', and the last `gradient` by the value gradient."""
-    found = ValueGradientOptions(updates=gradient, horizon=2) if gradient else None
-    rollouts = RolloutOptions(history=2)
-    return imagining(ETCQL, updates=10, warm_start=warm / 10, value_gradient=found, rollouts=rollouts)
+    options = ValueGradientOptions(updates=gradient, rollouts=4, horizon=2)
+    rollouts = GuardedRolloutOptions(history=2)
+    return imagining(ETCQL, updates=10, critic_updates=10 - warm - gradient, value_gradient=options, rollouts=rollouts)
 
 
 def visits(agent: Agent, updates: int) -> list[tuple[str, int]]:
@@ -47,9 +49,9 @@ def visits(agent: Agent, updates: int) -> list[tuple[str, int]]:
     return seen
 
 
-@pytest.mark.parametrize(("warm", "gradient"), [(2, 3), (0, 3), (7, 3), (0, 10), (4, 0), (0, 0)])
+@pytest.mark.parametrize(("warm", "gradient"), [(2, 3), (0, 3), (7, 3), (0, 10)])
 def test_each_phase_counts_its_own_updates(warm, gradient):
-    lengths = {"WarmStart": warm, "Losses": 10 - warm - gradient, "ValueGradient": gradient}
+    lengths = {"WatchedWarmStart": warm, "Losses": 10 - warm - gradient, "ValueGradient": gradient}
     expected = [(name, done) for name, length in lengths.items() for done in range(length)]
     agent = et_cql(warm, gradient)
     assert sum(phase.updates for phase in agent.phases) == 10
@@ -124,22 +126,19 @@ def test_descending_takes_the_rate_and_the_clip_that_are_wanted():
 
 
 @pytest.mark.parametrize(("schedule", "fall"), [("cosine", 1.0), ("constant", 0.0)])
-@pytest.mark.parametrize(("gradient", "scheduled"), [(0, 8), (3, 8)])
-def test_learning_rates_follow_the_losses_schedule(gradient, scheduled, schedule, fall):
-    """The actor's falls over all that follows the warm start, of which the value gradient may take the end."""
-    agent = et_cql(2, gradient)
-    agent.options = replace(agent.options, actor_schedule=schedule)
+def test_learning_rates_follow_the_losses_schedule(schedule, fall):
+    agent = hand_driven(CQL, updates=10, warm_start=0.2, actor_schedule=schedule)
     rates: dict[str, list[float]] = {"actor": [], "critics": [], "temperature": []}
-    for _ in range(10 - gradient):
+    for _ in range(10):
         agent.update(make_batch())
         agent.update_index += 1
         for part, seen in rates.items():
             seen.append(agent.optimizer(part).param_groups[0]["lr"])
-    peak, steps = agent.options.actor_learning_rate, range(8 - gradient)
-    cosine = [peak * (1 - fall * (0.5 - 0.5 * math.cos(math.pi * done / scheduled))) for done in steps]
+    peak, steps = agent.options.actor_learning_rate, range(8)
+    cosine = [peak * (1 - fall * (0.5 - 0.5 * math.cos(math.pi * done / 8))) for done in steps]
     assert rates["actor"] == pytest.approx([WARM_RATE] * 2 + cosine)
     assert rates["critics"] == pytest.approx([WARM_RATE] * 2 + [agent.options.critic_learning_rate] * len(steps))
-    assert rates["temperature"] == pytest.approx([peak] * (10 - gradient))
+    assert rates["temperature"] == pytest.approx([peak] * 10)
 
 
 def test_a_schedule_may_be_longer_than_its_losses():
@@ -168,7 +167,7 @@ def test_what_learns_from_data_alone_takes_none(cls):
 
 def test_imagined_rows_enter_the_losses_alone():
     """The warm start sees real rows; the losses a mixture, mixed under the actor that learns, from their first on."""
-    agent, mixed = et_cql(2, 0), []
+    agent, mixed = et_cql(2, 6), []
     original = agent.source.mix
     agent.source.mix = lambda *given: mixed.append(given[1:]) or original(*given)
     for _ in range(4):
@@ -181,29 +180,33 @@ def test_imagined_rows_enter_the_losses_alone():
 
 
 def after_an_epoch(agent: Any, **means: float) -> None:
+    """What an agent's own hook logs, and the guard that every training has behind it."""
     agent.effective_episodes, agent.logged = 5.0, {name: [torch.tensor(value)] for name, value in means.items()}
-    agent.log_dict = lambda *_: None
+    metrics: dict[str, torch.Tensor] = {}
+    agent.log_dict = metrics.update
     agent.on_train_epoch_end()
+    trainer: Any = SimpleNamespace(callback_metrics=metrics, current_epoch=0)
+    Guard().on_train_epoch_end(trainer, agent)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("name", ["clone_loss", "q_data"])
 def test_what_is_not_finite_stops_a_run(name, value):
-    with pytest.raises(UserError, match=f"CQL diverged in epoch 1: {name} is {value}, .* raise cql_weight, or lower"):
+    with pytest.raises(UserError, match=f"CQL diverged in epoch 1: train/{name} is {value}, .* raise cql_weight"):
         after_an_epoch(hand_driven(CQL), **{"q_target": 1.0, name: value})
 
 
 @pytest.mark.parametrize("name", ["q_data", "q_target", "q_policy"])
 def test_values_beyond_what_rewards_allow_stop_a_run(name):
     agent = hand_driven(SAC)
-    agent.largest_return = 3.0 / (1.0 - 0.99)  # rewards of at most three
+    agent.log_returns = LogReturns(largest=3.0 / (1.0 - 0.99))  # rewards of at most three
     agent.return_scale.fill_(100.0)
     after_an_epoch(agent, **{name: 6.9})  # twice that, and what a network says that has learned nothing
     after_an_epoch(agent, **{name: -1e6}, conservative_gap=1e6)
-    with pytest.raises(UserError, match=rf"{name} is 7\.1, where rewards allow 3 .* lower critic_learning_rate"):
+    with pytest.raises(UserError, match=rf"train/{name} is 7\.1, where rewards allow 3 .* lower critic_learning_rate"):
         after_an_epoch(agent, **{name: 7.1})
 
 
 def test_the_value_gradient_has_cures_of_its_own():
-    with pytest.raises(UserError, match=r"imagined_value is nan.* lower value_gradient\.learning_rate, or shorten"):
+    with pytest.raises(UserError, match=r"train/imagined_value is nan.* lower value_gradient\.learning_rate"):
         after_an_epoch(et_cql(2, 3), imagined_value=float("nan"))

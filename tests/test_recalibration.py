@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from test_transformer import A, S, batch_of, make_model, one_step, sequences
 
 from envtf_lit.world_models.forecast import Trajectories, forecast
 from envtf_lit.world_models.transformer import EnvironmentTransformer
@@ -12,6 +11,7 @@ from envtf_lit.world_models.uncertainty.recalibration import (
     variance_factor,
 )
 from envtf_lit.world_models.uncertainty.tails import MOST, half_width, log_density, normal_score, stretch
+from tests.transformers import A, S, batch_of, make_model, one_step, sequences
 
 
 def test_the_factor_by_hand():

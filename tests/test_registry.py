@@ -10,8 +10,9 @@ import pytest
 from torch import Tensor
 
 from envtf_lit.agents import registry
-from envtf_lit.agents.agent import Agent, Batch, Logs, Part
+from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs, Part
 from envtf_lit.cli.main import main
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError

@@ -14,12 +14,12 @@ from lightning.pytorch.callbacks import Callback
 
 from envtf_lit.agents.bc import BCOptions
 from envtf_lit.agents.cql import CQLOptions
-from envtf_lit.agents.et_cql import ETCQLOptions
+from envtf_lit.agents.et_cql import ETCQLOptions, GuardedRolloutOptions
 from envtf_lit.agents.value_gradient import ValueGradientOptions
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.files import read_json, write_json
-from envtf_lit.imagination.options import GenerateRolloutsOptions, RolloutOptions
+from envtf_lit.imagination.options import GenerateRolloutsOptions
 from envtf_lit.model_folders import load_weights
 from envtf_lit.pipeline.generate_rollouts import generate_rollouts
 from envtf_lit.pipeline.params import Params
@@ -41,8 +41,8 @@ MODEL = TransformerOptions(
 SIZES: dict[str, Any] = dict(updates=40, updates_per_epoch=10, batch_size=16, hidden=(16, 16), warm_start=0.25)
 ET_CQL = ETCQLOptions(
     **SIZES,
-    refresh_every=4,
-    rollouts=RolloutOptions(branches=20, horizon=2, value_expansion=2, history=2),
+    critic_updates=15,
+    rollouts=GuardedRolloutOptions(history=2),
     value_gradient=ValueGradientOptions(updates=15, rollouts=5, horizon=3),
 )
 TINY = Params(
@@ -160,7 +160,7 @@ def imagined(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("name", "epoch"),
-    [("bc", 2), ("cql", 2), ("et_cql", 1), ("et_cql", 2), ("et_cql", 3)],  # after warm start, amid CQL, amid the rest
+    [("bc", 2), ("cql", 2), ("et_cql", 1), ("et_cql", 2), ("et_cql", 3)],  # after the warm start, amid the rest
 )
 def test_a_killed_policy_run_resumes_to_the_same_bits(imagined, monkeypatch, name, epoch):
     train = lambda: train_policy(TINY, imagined, name=name, progress=False)  # noqa: E731
@@ -272,7 +272,8 @@ def test_policies_imagine_no_further_than_the_model_reaches(imagined, capsys):
     model = imagined / "models/world_model/transformer"
     reach = read_json(model / "metrics.json")["open_loop_0.1_median"]
     assert 0 <= reach <= 100
-    wide = replace(ET_CQL, rollouts=RolloutOptions(value_expansion=50), value_gradient=ValueGradientOptions(updates=5))
+    rollouts = GuardedRolloutOptions(value_expansion=50)
+    wide = replace(ET_CQL, rollouts=rollouts, value_gradient=ValueGradientOptions(updates=5))
     history = wide.rollouts.history
     for steps, expansion, horizon in ((7, 6, 7), (1, 0, history), (100, 50, 16)):
         write_json(model / "metrics.json", read_json(model / "metrics.json") | {"open_loop_0.1_median": steps})

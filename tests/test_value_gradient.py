@@ -9,18 +9,18 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit.agents import value_gradient
-from envtf_lit.agents.et_cql import ETCQL
+from envtf_lit.agents.et_cql import ETCQL, GuardedRolloutOptions
+from envtf_lit.agents.scales import LogReturns
+from envtf_lit.agents.trust import LEVELS, Level
 from envtf_lit.agents.value_gradient import (
     BETAS,
-    LOST,
     ImaginedPaths,
-    Paths,
-    StateValues,
     ValueGradient,
     ValueGradientOptions,
+    imagined_return,
+    lambda_targets,
 )
 from envtf_lit.errors import UserError
-from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.imagination.rollouts import Rollouts
 from envtf_lit.pipeline.params import build_params
 from envtf_lit.world_models.ensemble import EnsembleDynamics
@@ -31,11 +31,11 @@ from tests.hand_driven import EPISODES, flat, hand_driven, imagination, imagined
 
 OPTIONS = ValueGradientOptions(updates=4, rollouts=6, horizon=3)
 ONE = torch.ones(())
-SPREAD = 2.0
+LOW = 4.0  # value of a path that is lost
 
 
 class Constant(nn.Module):
-    """An actor that always takes the same action, and a state value that is the same everywhere."""
+    """An actor that always takes the same action."""
 
     def __init__(self, value: float) -> None:
         super().__init__()
@@ -44,46 +44,34 @@ class Constant(nn.Module):
     def sample(self, observation: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         return self.level.expand(len(observation), 1), torch.zeros(len(observation))
 
-    def forward(self, observation: Tensor) -> Tensor:
-        return self.level.expand(observation.shape[:-1])
 
-
-def make_values(value: float) -> StateValues:
-    values = StateValues(3)
-    values.value = values.target_value = Constant(value)  # pyright: ignore[reportAttributeAccessIssue]
-    return values
-
-
-def hand_made(last_reward: float = 3.0) -> Paths:
+def hand_made(last_reward: float = 3.0) -> Rollouts:
     """Two rollouts of three steps, neither of which leaves; the second falls at its second step."""
     paths = made_rollouts([[1.0, 1.0], [2.0, 2.0], [3.0, last_reward]])
     paths.terminated[1, 1] = True
-    return Paths(**vars(paths), excess=torch.zeros(3, 2))
+    return paths
 
 
-def test_a_paths_return_ends_with_the_fall_and_else_with_the_states_value():
-    returns = make_values(10.0).imagined_return(hand_made(), 0.5, SPREAD)
+def test_a_paths_return_ends_with_the_fall_and_else_with_the_value():
+    returns = imagined_return(hand_made(), torch.full((2,), 10.0), LOW, 0.5)
     torch.testing.assert_close(returns, torch.tensor([1.0 + 1.0 + 0.75 + 0.125 * 10.0, 1.0 + 1.0]))
 
 
-def test_where_the_model_is_lost_a_path_ends_at_the_last_known_states_value_less_its_cost():
+def test_where_the_model_is_lost_a_path_is_worth_little():
     """The prediction itself counts for nothing, whatever it promises; the other path falls at the same step."""
-    paths, worth = hand_made(), 10.0 - LOST * SPREAD * 0.3
-    paths.rewards[1, 0], paths.halted[1, 0], paths.excess[1, 0] = 1e6, True, 0.3
-    paths.halted[2], paths.excess[2] = True, 9.0  # after both have ended
-    returns = make_values(10.0).imagined_return(paths, 0.5, SPREAD)
-    torch.testing.assert_close(returns, torch.tensor([1.0 + 0.5 * worth, 1.0 + 1.0]))
-    targets = make_values(10.0).value_targets(paths, 0.5, SPREAD)
-    first = 1.0 + 0.5 * (0.05 * 10.0 + 0.95 * worth)
-    torch.testing.assert_close(targets[:2, 0], torch.tensor([first, worth]))
-    states = torch.cat([s for s, _ in make_values(0.0).value_batches(paths, 0.5, SPREAD, torch.Generator())])
-    assert set(states[:, 0].tolist()) == {0.0, 1.0, 10.0, 11.0}
+    paths, later = hand_made(), torch.full((3, 2), 10.0)
+    paths.rewards[1, 0], paths.halted[1, 0] = 1e6, True
+    paths.halted[2] = True  # after both have ended
+    returns = imagined_return(paths, later[0], LOW, 0.5)
+    torch.testing.assert_close(returns, torch.tensor([1.0 + 0.5 * LOW, 1.0 + 1.0]))
+    targets = lambda_targets(paths, later, LOW, 0.5)
+    torch.testing.assert_close(targets[:2, 0], torch.tensor([1.0 + 0.5 * (0.05 * 10.0 + 0.95 * LOW), LOW]))
 
 
 @pytest.mark.parametrize("trace", [0.0, 0.5, 1.0])
 def test_value_targets_are_td_lambda(trace, monkeypatch):
     monkeypatch.setattr(value_gradient, "TRACE", trace)
-    targets = make_values(10.0).value_targets(hand_made(), 0.5, SPREAD)
+    targets = lambda_targets(hand_made(), torch.full((3, 2), 10.0), LOW, 0.5)
     last = 3.0 + 0.5 * 10.0
     middle = 2.0 + 0.5 * ((1 - trace) * 10.0 + trace * last)
     first = 1.0 + 0.5 * ((1 - trace) * 10.0 + trace * middle)
@@ -91,30 +79,24 @@ def test_value_targets_are_td_lambda(trace, monkeypatch):
     torch.testing.assert_close(targets[:2, 1], torch.tensor([1.0 + 0.5 * ((1 - trace) * 10.0 + trace * 2.0), 2.0]))
 
 
-def test_the_value_learns_nothing_from_steps_after_a_fall(monkeypatch):
-    monkeypatch.setattr(value_gradient, "PASSES", 3)
-    batches = list(make_values(10.0).value_batches(hand_made(1e6), 0.5, SPREAD, torch.Generator().manual_seed(0)))
-    assert sum(len(states) for states, _ in batches) == 3 * 5
-    assert max(float(targets.max()) for _, targets in batches) < 100.0
-
-
-def test_every_pass_pairs_each_state_with_its_target(monkeypatch):
-    monkeypatch.setattr(value_gradient, "BATCH", 2)
-    values, paths = make_values(10.0), hand_made()
-    targets = values.value_targets(paths, 0.5, SPREAD)
-    expected = {(float(paths.observations[t, b, 0]), float(targets[t, b])) for t in range(3) for b in range(2)}
-    expected.discard((12.0, float(targets[2, 1])))  # after the fall
-    batches = list(values.value_batches(paths, 0.5, SPREAD, torch.Generator().manual_seed(0)))
-    assert {len(states) for states, _ in batches} == {1, 2}
-    pairs = [(float(s[0]), float(g)) for states, goals in batches for s, g in zip(states, goals, strict=True)]
-    assert set(pairs) == expected and len(pairs) == value_gradient.PASSES * 5
+def test_critics_learn_nothing_from_steps_after_a_fall():
+    """Each row pairs a state that a path stood in with its own target, and nothing is bootstrapped again."""
+    agent = make_agent()
+    agent.target_critics.forward = lambda states, actions: torch.full((2, len(states)), 10.0)
+    rows = agent.phases[-1].rows(agent, hand_made(1e6))
+    targets = lambda_targets(hand_made(1e6), torch.full((3, 2), 10.0), 0.0, agent.options.discount)
+    stood = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1)]
+    expected = {(10.0 * b + t, round(float(targets[t, b]), 4)) for t, b in stood}
+    found = zip(rows["observations"][:, 0].tolist(), rows["rewards"].tolist(), strict=True)
+    assert {(state, round(target, 4)) for state, target in found} == expected
+    assert not rows["discounts"].any() and not rows["real"].any()
 
 
 def test_the_gradient_through_the_world_equals_finite_differences():
     def value(level: float) -> tuple[Tensor, Constant]:
         actor: Any = Constant(level)
         paths = ImaginedPaths(imagination(), OPTIONS).next(actor, ONE, torch.Generator().manual_seed(0))
-        return make_values(2.0).imagined_return(paths, 0.9, SPREAD).mean(), actor
+        return imagined_return(paths, torch.full((6,), 2.0), LOW, 0.9).mean(), actor
 
     middle, actor = value(0.3)
     middle.backward()
@@ -164,10 +146,10 @@ class Known(LinearWorld):
 
 def improved(penalty: float, limit: float | None) -> tuple[float, float]:
     """The mean action, and the share of paths that are cut, after some updates in a world that promises riches."""
-    agent, batch = make_agent(penalty=penalty, novelty_limit=limit), log_batch()
+    agent, batch = trusting(make_agent(penalty=penalty, novelty_limit=limit), 20.0), log_batch()
     agent.source.imagination.model = Known(**vars(linear_world()))
     agent.source.imagination.reward_std = 1.0
-    agent.return_spread = 58.0 / (1.0 - 0.9**2) ** 0.5  # of such rewards, where a log's actions are uniform
+    agent.log_returns = LogReturns(spread=58.0 / (1.0 - 0.9**2) ** 0.5)  # of such rewards, under random actions
     for _ in range(40):
         found = agent.update(batch)
         agent.update_index += 1
@@ -231,7 +213,7 @@ def test_the_lost_begin_anew_at_real_states():
 
 
 def test_rollouts_under_way_do_not_outlive_an_epoch():
-    phase, generator = ValueGradient(imagination(), make_values(0.0), OPTIONS), torch.Generator().manual_seed(0)
+    phase, generator = ValueGradient(imagination(), OPTIONS, LEVELS["default"]), torch.Generator().manual_seed(0)
     actor: Any = Constant(1.0)
     for begun, real in ((False, True), (False, False), (True, True)):
         if begun:
@@ -239,17 +221,19 @@ def test_rollouts_under_way_do_not_outlive_an_epoch():
         assert begins_at_real_states(phase.paths.next(actor, ONE, generator)) is real
 
 
-def test_the_learning_rate_rises_over_a_tenth_and_falls_to_zero():
-    phase = ValueGradient(imagination(), make_values(0.0), replace(OPTIONS, learning_rate=0.9))
-    progress = [0.0, 0.05, 0.1, 0.55, 1.0]
-    assert [phase.rate(x) for x in progress] == pytest.approx([0.0, 0.45, 0.9, 0.45, 0.0])
+def test_the_learning_rate_rises_over_a_tenth_and_falls_over_the_last():
+    phase = ValueGradient(imagination(), replace(OPTIONS, learning_rate=0.9), LEVELS["default"])
+    progress = [0.0, 0.05, 0.1, 0.55, 0.95, 1.0]
+    assert [phase.rate(x) for x in progress] == pytest.approx([0.0, 0.45, 0.9, 0.9, 0.45, 0.0])
 
 
 def make_agent(**rollouts: Any) -> Any:
     options = replace(OPTIONS, updates=60, learning_rate=0.01)
-    plain = RolloutOptions(history=2)
+    plain = GuardedRolloutOptions(history=2)
     source = imagined_batches(**rollouts)
-    return hand_driven(ETCQL, source=source, discount=0.9, rollouts=plain, value_gradient=options)
+    return hand_driven(
+        ETCQL, source=source, discount=0.9, rollouts=plain, value_gradient=options, critic_updates=0, trust="bold"
+    )
 
 
 def log_batch() -> dict[str, Tensor]:
@@ -261,59 +245,60 @@ def log_batch() -> dict[str, Tensor]:
         returns=torch.as_tensor(data.rewards),
         tails=torch.zeros(len(data)),
         last_observations=torch.as_tensor(data.next_observations),
+        next_observations=torch.as_tensor(data.next_observations),
+        following_observations=torch.as_tensor(data.next_observations),
+        discounts=torch.zeros(len(data)),
     )
 
 
-def test_the_actor_improves_and_leaves_the_critics_alone():
-    """More action is more reward in this world, so the mean action rises towards its limit."""
-    agent, batch = make_agent(), log_batch()
-    critics = copy.deepcopy(agent.critics.state_dict())
-    before = float(agent.actor.act(batch["observations"], deterministic=True).mean())
-    for _ in range(60):
-        agent.update(batch)
-        agent.update_index += 1
-    after = float(agent.average_actor.act(batch["observations"], deterministic=True).mean())
-    assert after > before + 0.3
-    assert all(torch.equal(value, critics[name]) for name, value in agent.critics.state_dict().items())
+def trusting(agent: Any, slack: float) -> Any:
+    """The agent, whose value gradient may leave the log by so many nats; and as if it had cloned it."""
+    agent.phases[-1].level = Level(slack, 0.0, believes=True)
+    agent.trust.look(agent.actor)
+    return agent
+
+
+def test_the_actor_improves_as_far_as_trust_reaches():
+    """More action is more reward in this world, so the mean action rises: by more, the further trust reaches."""
+
+    def rise(slack: float) -> float:
+        agent, batch = trusting(make_agent(), slack), log_batch()
+        before = float(agent.actor.act(batch["observations"]).mean())
+        for _ in range(59):
+            agent.update(batch)
+            agent.update_index += 1
+        return float(agent.average_actor.act(batch["observations"]).mean()) - before
+
+    far, near = rise(20.0), rise(0.01)
+    assert far > 0.3 and near < 0.5 * far
+
+
+def test_critics_learn_from_paths_and_from_real_rows():
+    agent, batch, seen = trusting(make_agent(), 1.0), log_batch(), []
+    original = agent.critic_loss
+    agent.critic_loss = lambda mixed: seen.append(mixed) or original(mixed)
+    agent.update(batch)
+    assert len(seen) == value_gradient.CRITIC_STEPS
+    for mixed in seen:
+        assert len(mixed["real"]) == 70 and float(mixed["real"].mean()) == pytest.approx(0.25, abs=0.01)
 
 
 def test_the_value_gradient_begins_at_the_averaged_actor_with_an_adam_of_its_own():
     agent = make_agent()
     average = flat(copy.deepcopy(agent.average_actor.state_dict()))
     nn.init.ones_(agent.actor.net[0].weight)
-    agent.update(log_batch())  # at a rate of zero
+    trusting(agent, 1.0).update(log_batch())  # at a rate of zero
     assert torch.equal(flat(agent.actor.state_dict()), average)
     assert agent.optimizer("actor_by_gradient").param_groups[0]["betas"] == BETAS
     assert agent.optimizer("actor").param_groups[0]["betas"] == (0.9, 0.999)
 
 
-def test_the_warm_start_fits_the_state_value_to_the_logs_returns():
-    options = RolloutOptions(history=2)
-    agent = hand_driven(
-        ETCQL, source=imagined_batches(), warm_start=0.5, rollouts=options, value_gradient=replace(OPTIONS, updates=30)
-    )
-    batch = log_batch()
-
-    def error() -> float:
-        return agent.values.value_loss(batch["observations"], batch["returns"]).item()
-
-    before = error()
-    for _ in range(30):
-        agent.update(batch)
-        agent.update_index += 1
-    assert error() < 0.2 * before
-    assert torch.equal(flat(agent.values.target_value.state_dict()), flat(agent.values.value.state_dict()))
-
-
-def test_without_a_value_gradient_there_is_no_state_value():
-    agent = hand_driven(ETCQL, source=imagined_batches(), value_gradient=None)
-    assert [*agent.parts()] == ["actor", "critics", "temperature"] and not hasattr(agent, "values")
-    assert len(agent.phases) == 2
-
-
 @pytest.mark.parametrize(
     ("changed", "words"),
-    [({"horizon": 2}, ["horizon is 2", "history is 4"]), ({"updates": 4_000}, ["updates is 4000", "3000 updates"])],
+    [
+        ({"horizon": 2}, ["horizon is 2", "history is 4"]),
+        ({"updates": 4_000}, ["updates is 4000", "critic_updates is 1000", "4500 updates"]),
+    ],
 )
 def test_contradicting_options_are_named(changed, words):
     section = {"algorithm": "et_cql", "value_gradient": changed}

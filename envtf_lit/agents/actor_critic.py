@@ -9,8 +9,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from envtf_lit.agents.agent import Agent, Batch, Logs, Losses, Phase, follow
+from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.networks import StackedCritics
+from envtf_lit.agents.phases import Batch, Logs, Losses, Phase, follow
 from envtf_lit.agents.warm_start import WarmStart
 
 WARM_TARGET_RATE = 0.05  # share of the critics that enters the target networks at each update of the warm start
@@ -71,8 +72,8 @@ class ActorCritic(Agent):
 
     def validation_logs(self, batch: Batch) -> Logs:
         q = self.return_scale * self.critics(batch["observations"], batch["actions"]).min(0).values
-        returns = batch["returns"] + batch["tails"] * self.typical_return
-        return dict(q_data=q.mean(), return_error=((q - returns) / self.return_spread).square().mean())
+        returns = batch["returns"] + batch["tails"] * self.log_returns.typical
+        return dict(q_data=q.mean(), return_error=((q - returns) / self.log_returns.spread).square().mean())
 
 
 @contextlib.contextmanager

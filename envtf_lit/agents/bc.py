@@ -7,8 +7,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from envtf_lit.agents.agent import Agent, Batch, Logs, Part
+from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs, Part
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.options.numbers import NonzeroShare

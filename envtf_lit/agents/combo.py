@@ -14,8 +14,8 @@ from envtf_lit.options.schema import rare
 
 
 @dataclass(frozen=True)
-class ImaginingOptions(CQLOptions):
-    """Options of policies that learn from imagined rows, too.
+class MixingOptions(PolicyOptions):
+    """Options of policies that learn from imagined rows in a transformer, too.
 
     Attributes:
         real_ratio: share of real rows in each batch, in (0, 1].
@@ -43,6 +43,11 @@ class ImaginingOptions(CQLOptions):
         o = self.rollouts
         expansion = max(0, min(o.value_expansion, reach - o.horizon))
         return replace(self, rollouts=replace(o, value_expansion=expansion))
+
+
+@dataclass(frozen=True)
+class ImaginingOptions(MixingOptions, CQLOptions):
+    """Options of conservative soft actor-critic on real and imagined rows."""
 
 
 @dataclass(frozen=True)

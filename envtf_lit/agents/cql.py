@@ -8,16 +8,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from envtf_lit.agents.agent import Batch, Logs
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs
 from envtf_lit.agents.sac import SAC, SACOptions
 from envtf_lit.options.numbers import Count, NonNegative, Positive
 from envtf_lit.options.schema import rare
 
 
 @dataclass(frozen=True)
-class CQLOptions(SACOptions):
-    """Conservative Q-Learning's own options.
+class ConservativeOptions(PolicyOptions):
+    """Options of the conservative term.
 
     Attributes:
         cql_weight: weight of the conservative term. In units of Q as the critics learn it, which `normalise_returns`
@@ -32,6 +32,11 @@ class CQLOptions(SACOptions):
     cql_weight: NonNegative = 0.1
     cql_temperature: Positive = rare(1.0)
     sampled_actions: Count = rare(2)
+
+
+@dataclass(frozen=True)
+class CQLOptions(ConservativeOptions, SACOptions):
+    """Conservative Q-Learning has the options of its term, and soft actor-critic's."""
 
 
 class CQL(SAC):

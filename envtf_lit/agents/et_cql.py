@@ -2,25 +2,23 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
-from envtf_lit.agents.agent import Batch, Logs, Losses, Part, Phase
-from envtf_lit.agents.combo import COMBO, ImaginingOptions
-from envtf_lit.agents.cql import CQL
+from envtf_lit.agents.actor_critic import ActorCritic
+from envtf_lit.agents.combo import COMBO, ImaginingOptions, MixingOptions
+from envtf_lit.agents.cql import CQL, ConservativeOptions
+from envtf_lit.agents.frontier import Frontier
 from envtf_lit.agents.options import PolicyOptions
-from envtf_lit.agents.value_gradient import (
-    BETAS,
-    LEARNING_RATE,
-    StateValues,
-    ValueGradient,
-    ValueGradientOptions,
-)
-from envtf_lit.agents.warm_start import WarmStart
+from envtf_lit.agents.phases import Batch, Logs, Losses, Part, Phase
+from envtf_lit.agents.trust import LEVELS, Trust, TrustLevel, WatchedWarmStart
+from envtf_lit.agents.value_gradient import BETAS, PLACES, ValueGradient, ValueGradientOptions
+from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.options.numbers import Count, Natural, NonNegative, NonzeroShare, Positive
+from envtf_lit.options.schema import rare
 
 
 @dataclass(frozen=True)
@@ -52,86 +50,112 @@ class ETCQLPaper(CQL):
 
 
 @dataclass(frozen=True)
-class ETCQLOptions(ImaginingOptions):
+class GuardedRolloutOptions(RolloutOptions):
+    """Imagined paths of the value gradient: each in a world of its own, up to where the model leaves what it knows."""
+
+    branches: Count = rare(1_500)
+    horizon: Count = rare(1)
+    value_expansion: Natural = rare(0)
+
+
+@dataclass(frozen=True)
+class ETCQLOptions(MixingOptions, ConservativeOptions):
     """Our own variant's options.
 
     Attributes:
-        value_gradient: the end of the training, in which the actor follows the gradient through the world model; null
-            leaves all updates to CQL.
+        trust: how far the policy may leave what the log supports: `cautious`, `default`, or `bold`, which is for those
+            who can try it in a simulator (`trust.LEVELS`).
+        critic_updates: before the value gradient, in which critics learn the clone's value on real rows and on those of
+            `generate_rollouts`. All updates before are the warm start, whatever the common `warm_start` says.
+        value_gradient: the end of the training, in which the actor follows the gradient through the world model.
     """
 
-    value_gradient: ValueGradientOptions | None = field(default_factory=ValueGradientOptions)
+    cql_weight: NonNegative = 0.01
+    sampled_actions: Count = rare(1)
+    real_ratio: NonzeroShare = 0.5
+    refresh_every: Natural = rare(0)
+    trust: TrustLevel = "default"
+    critic_updates: Natural = 1_000
+    rollouts: GuardedRolloutOptions = field(default_factory=GuardedRolloutOptions)
+    value_gradient: ValueGradientOptions = field(default_factory=ValueGradientOptions)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         gradient = self.value_gradient
-        if gradient is None:
-            return
         if gradient.horizon < self.rollouts.history:
             raise UserError(
                 f"value_gradient.horizon is {gradient.horizon} and rollouts.history is {self.rollouts.history}: "
                 "rollouts carried on take their history from the steps before, so take a horizon of at least that."
             )
-        if gradient.updates > self.updates - self.warm_updates:
+        if gradient.updates + self.critic_updates > self.updates:
             raise UserError(
-                f"value_gradient.updates is {gradient.updates}, and {self.updates - self.warm_updates} updates come "
-                "after the warm start: take no more than those."
+                f"value_gradient.updates is {gradient.updates} and critic_updates is {self.critic_updates}, of "
+                f"{self.updates} updates in all: take fewer, or raise updates."
             )
 
     @property
+    def warm_updates(self) -> int:
+        return self.updates - self.critic_updates - self.value_gradient.updates
+
+    @property
     def path_lengths(self) -> dict[str, int]:
-        lengths, gradient = super().path_lengths, self.value_gradient
-        return lengths if gradient is None else lengths | {"value_gradient.horizon": gradient.horizon}
+        return super().path_lengths | {"value_gradient.horizon": self.value_gradient.horizon}
 
     def within(self, reach: int) -> Self:
         """The value gradient's horizon is cut likewise, though not below the history that paths carry on with."""
-        cut, gradient = super().within(reach), self.value_gradient
-        if gradient is None:
-            return cut
-        horizon = min(gradient.horizon, max(reach, self.rollouts.history, 1))
-        return replace(cut, value_gradient=replace(gradient, horizon=horizon))
+        horizon = min(self.value_gradient.horizon, max(reach, self.rollouts.history, 1))
+        return replace(super().within(reach), value_gradient=replace(self.value_gradient, horizon=horizon))
 
 
 class ETCQL(COMBO):
-    """CQL in COMBO's form on data and fresh imagination, then the actor follows the gradient of imagined returns."""
+    """Conservative Q-learning on the log and on long imagination, in one objective, as far as the log can be left.
+
+    A clone, stopped by held-out likelihood; critics that learn its conservative Q (COMBO's form) on real rows and on
+    those of `generate_rollouts`; then `ValueGradient`: the actor climbs imagined returns that end in that Q, which goes
+    on learning, under a constraint on its held-out likelihood.
+    """
 
     Options: ClassVar[type[PolicyOptions]] = ETCQLOptions
     label = "ET + CQL"
+    watches = True
     cures: ClassVar[Mapping[str, str]] = {**COMBO.cures} | dict.fromkeys(
-        ("imagined_value", "value_loss"), "lower value_gradient.learning_rate, or shorten value_gradient.horizon"
+        ("imagined_value", "trust_weight"), "lower value_gradient.learning_rate, or shorten value_gradient.horizon"
     )
-    options: ETCQLOptions
+    options: ETCQLOptions  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def build_networks(self) -> None:
-        super().build_networks()
-        if self.options.value_gradient is not None:
-            self.values = StateValues(self.observation_dim)
+        ActorCritic.build_networks(self)  # no temperature: nothing here asks for entropy
+        self.trust = Trust(self.actor)
+        self.frontier = Frontier(self.actor, 1 + PLACES)
 
     def build_phases(self) -> list[Phase]:
         o = self.options
-        if o.value_gradient is None:
-            return super().build_phases()
         assert self.source is not None
-        warm, last = o.warm_updates, o.value_gradient.updates
-        losses = Losses(o.updates - warm - last, scheduled=o.updates - warm)
-        return [WarmStart(warm), losses, ValueGradient(self.source.imagination, self.values, o.value_gradient)]
+        gradient = ValueGradient(self.source.imagination, o.value_gradient, LEVELS[o.trust])
+        return [WatchedWarmStart(o.warm_updates, self.trust), Losses(o.critic_updates), gradient]
 
     def parts(self) -> dict[str, Part]:
-        gradient = self.options.value_gradient
-        if gradient is None:
-            return super().parts()
-        return super().parts() | dict(
-            actor_by_gradient=Part(self.actor, gradient.learning_rate, BETAS),
-            value=Part(self.values.value, LEARNING_RATE),
+        return dict(
+            actor=Part(self.actor, self.options.actor_learning_rate),
+            critics=Part(self.critics, self.options.critic_learning_rate),
+            actor_by_gradient=Part(self.actor, self.options.value_gradient.learning_rate, BETAS),
         )
 
-    def warm_start_losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
-        """Beside critics and actor, the state value of the value gradient learns the log's returns."""
-        yield from super().warm_start_losses(batch)
-        if self.options.value_gradient is not None:
-            yield "value", self.values.value_loss(batch["observations"], batch["returns"]), {}
+    def losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
+        """The critics' alone: the actor stays the clone until it follows the gradient."""
+        loss, logs = self.critic_loss(batch)
+        yield "critics", loss, logs
 
-    def end_warm_start(self) -> None:
-        super().end_warm_start()
-        if self.options.value_gradient is not None:
-            self.values.target_value.load_state_dict(self.values.value.state_dict())
+    def setup(self, stage: str) -> None:
+        super().setup(stage)
+        data: TransitionData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
+        if data.validation_rows is None:
+            raise UserError(
+                f"{self.label} watches its likelihood of held-out episodes, and none are held out: give the share of "
+                "the episodes to hold out, held_out=0.1."
+            )
+        self.trust.begin(data.validation_rows, self.seed, self.device)
+
+    def records(self) -> dict[str, list[dict[str, Any]]]:
+        """The frontier, as `frontier.csv`."""
+        return {"frontier": self.frontier.rows()}

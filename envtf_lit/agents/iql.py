@@ -9,9 +9,9 @@ from torch import Tensor
 
 from envtf_lit.actors import Actor, GaussianActor
 from envtf_lit.agents.actor_critic import ActorCritic
-from envtf_lit.agents.agent import Batch, Logs, Part
 from envtf_lit.agents.networks import PlainStateValue
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs, Part
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.options.numbers import InnerShare, Positive
 

@@ -6,9 +6,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from envtf_lit.agents.agent import Batch
 from envtf_lit.agents.model_based import ModelBased, ModelBasedOptions
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch
 from envtf_lit.options.numbers import Count, NonNegative
 from envtf_lit.world_models.observed import bare
 from envtf_lit.world_models.uncertainty.members import check_members, member_predictions

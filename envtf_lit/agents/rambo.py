@@ -8,9 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from envtf_lit.agents.agent import Batch, Logs, Part
 from envtf_lit.agents.model_based import ModelBased, ModelBasedOptions
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs, Part
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.loaders import Windows
 from envtf_lit.errors import UserError

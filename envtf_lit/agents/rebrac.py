@@ -5,8 +5,8 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from envtf_lit.agents.agent import Batch, Logs
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs
 from envtf_lit.agents.td3_bc import TD3, TD3Options
 from envtf_lit.options.numbers import NonNegative
 

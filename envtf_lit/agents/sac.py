@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.agents.actor_critic import ActorCritic, held_fixed
-from envtf_lit.agents.agent import Batch, Logs, Part
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs, Part
 from envtf_lit.options.numbers import NonNegative
 
 INITIAL_ALPHA = 0.01  # weight of the entropy in the actor's objective at the start; learned from there on

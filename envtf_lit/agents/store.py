@@ -1,17 +1,22 @@
 """Policies on disk, with what is known of their training."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from envtf_lit.actors import Actor
-from envtf_lit.files import replacing
+from envtf_lit.files import replacing, write_table
 from envtf_lit.policy import save_policy
 from envtf_lit.training import Curves, record_training
 
 
 def publish_policy(
-    target: Path, actor: Actor, curves: Curves, kept: Mapping[str, float], settings: dict[str, Any]
+    target: Path,
+    actor: Actor,
+    curves: Curves,
+    kept: Mapping[str, float],
+    settings: dict[str, Any],
+    records: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
 ) -> dict[str, Any]:
     """Writes a policy's folder.
 
@@ -21,6 +26,7 @@ def publish_policy(
         curves: of the training.
         kept: the row of them that belongs to the actor.
         settings: the resolved options.
+        records: further tables (`Algorithm.records`), each written as `NAME.csv`.
 
     Returns:
         The row, its columns named without their split.
@@ -29,4 +35,6 @@ def publish_policy(
     with replacing(target) as folder:
         save_policy(folder, actor)
         record_training(folder, metrics, settings, curves)
+        for name, rows in (records or {}).items():
+            write_table(folder / f"{name}.csv", rows)
     return metrics

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from envtf_lit.actors import Actor, DeterministicActor
 from envtf_lit.agents.actor_critic import ActorCritic, held_fixed
-from envtf_lit.agents.agent import Batch, Logs, Part, follow
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs, Part, follow
 from envtf_lit.options.numbers import Count, NonNegative
 
 

@@ -1,6 +1,7 @@
 """The warm start: before an algorithm's own losses, values fit the log's returns and the actor clones its actions."""
 
-from envtf_lit.agents.agent import Agent, Batch, Logs, Phase
+from envtf_lit.agents.agent import Agent
+from envtf_lit.agents.phases import Batch, Logs, Phase
 
 LEARNING_RATE = 0.001  # Adam's, of all that learns here
 
@@ -15,8 +16,16 @@ class WarmStart(Phase):
         logs: Logs = {}
         batch = agent.complete_returns(batch)
         for part, loss, found in agent.warm_start_losses(batch):
-            agent.descend(part, loss, rate=LEARNING_RATE)
+            agent.descend(part, loss, rate=self.rate(done))
             logs |= found
         if done == self.updates - 1:
-            agent.end_warm_start()
+            self.finish(agent)
         return logs
+
+    def rate(self, done: int) -> float:
+        """The learning rate after so many updates."""
+        return LEARNING_RATE
+
+    def finish(self, agent: Agent) -> None:
+        """After the last update."""
+        agent.end_warm_start()

@@ -7,9 +7,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from envtf_lit.agents.agent import Agent, Batch, Logs, Part
+from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.networks import PlainStateValue
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import Batch, Logs, Part
 from envtf_lit.options.numbers import NonNegative
 
 LARGEST_WEIGHT = 20.0  # of a row, as AWR has it

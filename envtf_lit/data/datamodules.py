@@ -11,13 +11,14 @@ from torch.utils.data import DataLoader, Dataset
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import (
     UPDATES_PER_STEP,
+    DrawnRows,
     DrawSampler,
     Resamples,
+    ReturnWeights,
     Transitions,
     Windows,
     effective_episodes,
     epoch_generator,
-    return_weights,
 )
 from envtf_lit.data.sources.files import load_dataset
 
@@ -113,7 +114,9 @@ class TransitionData(L.LightningDataModule):
     """Transitions for agents, several batches at a time.
 
     Attributes:
-        chances: (N,) of each row, beside those of `return_weights`; None for equal ones. An agent may set them.
+        chances: (N,) of each row, beside those of `ReturnWeights`; None for equal ones. An agent may set them.
+        dataset: what is learned from.
+        validation: that half of the held-out episodes which may choose between actors; None where all are learned from.
 
     Args:
         path: dataset file, HDF5 or NPZ.
@@ -121,7 +124,7 @@ class TransitionData(L.LightningDataModule):
         steps_per_epoch: Lightning training steps per epoch.
         discount: of future rewards, per step.
         n_step: steps whose rewards enter the temporal-difference target.
-        return_temperature: of `return_weights`; None draws rows uniformly.
+        return_temperature: of `ReturnWeights`; None draws rows uniformly.
         fewest_episodes: likewise.
         held_out: 0 takes all episodes; more leaves out those that the dataset says are held out, else that share of
             them, the ones that `WindowData` holds out with the same share and seed.
@@ -129,6 +132,8 @@ class TransitionData(L.LightningDataModule):
     """
 
     chances: Tensor | None
+    dataset: OfflineDataset
+    validation: OfflineDataset | None
 
     def __init__(
         self,
@@ -147,8 +152,10 @@ class TransitionData(L.LightningDataModule):
         self.discount, self.n_step, self.seed = discount, n_step, seed
         self.return_temperature, self.fewest_episodes = return_temperature, fewest_episodes
         self.chances = None
-        whole = self.read(path)
-        self.dataset = whole.split(held_out, seed=seed)[0] if held_out > 0 else whole
+        self.dataset, self.validation = self.read(path), None
+        if held_out > 0:
+            self.dataset, unseen = self.dataset.split(held_out, seed=seed)
+            self.validation = unseen.validation_and_test()[0]
         self.observation_dim, self.action_dim = self.dataset.observation_dim, self.dataset.action_dim
         self.action_low, self.action_high = self.dataset.action_low.tolist(), self.dataset.action_high.tolist()
 
@@ -164,10 +171,25 @@ class TransitionData(L.LightningDataModule):
     @cached_property
     def weights(self) -> Tensor | None:
         """(N,) chances of each row, up to a factor; None where they are equal."""
-        if self.return_temperature is None:
+        if self.return_weights is None:
             return self.chances
-        weights = return_weights(self.dataset, self.return_temperature, self.fewest_episodes)
+        weights = self.return_weights(self.dataset)
         return weights if self.chances is None else weights * self.chances
+
+    @cached_property
+    def return_weights(self) -> ReturnWeights | None:
+        """How an episode's return weighs its rows; None where it does not."""
+        if self.return_temperature is None:
+            return None
+        return ReturnWeights.of(self.dataset, self.return_temperature, self.fewest_episodes)
+
+    @cached_property
+    def validation_rows(self) -> DrawnRows | None:
+        """Rows of held-out episodes, drawn by the same rule as those of training; None where all are learned from."""
+        if self.validation is None:
+            return None
+        weights = None if self.return_weights is None else self.return_weights(self.validation)
+        return DrawnRows(self.validation, weights, _device(self))
 
     @cached_property
     def effective_episodes(self) -> float:

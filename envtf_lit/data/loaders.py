@@ -7,6 +7,8 @@ an epoch's start sees the same rows as one that was never interrupted.
 
 import copy
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -93,34 +95,50 @@ class DrawSampler(Sampler[Tensor]):
             yield drawn[..., self.share]
 
 
-def return_weights(dataset: OfflineDataset, temperature: float, fewest_episodes: int = 1) -> Tensor:
-    """(N,) `exp(R / temperature)`, R the row's episode return scaled to [0, 1] (Hong et al. 2023).
+@dataclass(frozen=True)
+class ReturnWeights:
+    """`exp(R / temperature)`, R the row's episode return scaled to [0, 1] (Hong et al. 2023).
 
     A log that is mostly poor then teaches what its best episodes did; a small temperature means a sharp preference.
 
-    Args:
-        dataset: whose rows.
-        temperature: raised as far as it must be for rows to come from enough episodes.
-        fewest_episodes: effective number of episodes (`effective_episodes`) that rows come from, or as many as equal
-            chances give.
+    Attributes:
+        lowest, spread: of the episodes' returns that are scaled; a spread of 1 where all are equal.
+        inverse: of the temperature.
     """
-    returns, even = dataset.episode_returns, torch.ones(len(dataset))
-    scaled = (returns - returns.min()) / (np.ptp(returns) or 1.0)  # 1: all are equal
 
-    def weights(inverse: float) -> Tensor:
-        return torch.as_tensor(np.exp((scaled - 1.0) * inverse)[dataset.episode_index])
+    lowest: float
+    spread: float
+    inverse: float
 
-    def enough(inverse: float) -> bool:
-        return effective_episodes(dataset, weights(inverse)) >= floor
+    @classmethod
+    def of(cls, dataset: OfflineDataset, temperature: float, fewest_episodes: int = 1) -> Self:
+        """The weights of a dataset's rows.
 
-    floor = min(float(fewest_episodes), effective_episodes(dataset, even))
-    low, high = 0.0, 1.0 / temperature  # of the inverse: equal chances are enough
-    if enough(high):
-        return weights(high)
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if enough(middle) else (low, middle)
-    return weights(low)
+        Args:
+            dataset: whose rows.
+            temperature: raised as far as it must be for rows to come from enough episodes.
+            fewest_episodes: effective number of episodes (`effective_episodes`) that rows come from, or as many as
+                equal chances give.
+        """
+        returns, even = dataset.episode_returns, torch.ones(len(dataset))
+        scale = float(returns.min()), float(np.ptp(returns)) or 1.0
+
+        def enough(inverse: float) -> bool:
+            return effective_episodes(dataset, cls(*scale, inverse)(dataset)) >= floor
+
+        floor = min(float(fewest_episodes), effective_episodes(dataset, even))
+        low, high = 0.0, 1.0 / temperature  # of the inverse: equal chances are enough
+        if enough(high):
+            return cls(*scale, high)
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if enough(middle) else (low, middle)
+        return cls(*scale, low)
+
+    def __call__(self, dataset: OfflineDataset) -> Tensor:
+        """(N,) weights of the rows of this dataset or of another, such as what was held out of it."""
+        scaled = (dataset.episode_returns - self.lowest) / self.spread
+        return torch.as_tensor(np.exp((scaled.clip(0.0, 1.0) - 1.0) * self.inverse)[dataset.episode_index])
 
 
 def effective_episodes(dataset: OfflineDataset, weights: Tensor) -> float:
@@ -175,6 +193,26 @@ def _place(column: Column, device: torch.device, resident: bool) -> Tensor | Fil
     for block in column_blocks(column):
         placed[block] = torch.as_tensor(column[block]).to(device)
     return placed
+
+
+class DrawnRows:
+    """Observations and actions of a log, rows drawn at random.
+
+    Args:
+        dataset: whose rows.
+        weights: (N,) chances of each row, up to a factor; None draws uniformly.
+        device: where they go.
+    """
+
+    def __init__(
+        self, dataset: OfflineDataset, weights: Tensor | None = None, device: torch.device | str = "cpu"
+    ) -> None:
+        self.rows = WeightedRows(torch.ones(len(dataset)) if weights is None else weights, device)
+        self.store = Store(dataset, ("observations", "actions"), device)
+
+    def draw(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """`observations` (count, S) and `actions` (count, A); `generator` is on the device."""
+        return self.store[self.rows.draw((count,), generator)]
 
 
 class Windows(Dataset[dict[str, Tensor]]):

@@ -38,6 +38,10 @@ class Imagination:
         self.model, self.terminated, self.options = model, terminated, options
         self.starts = BranchPoints(dataset, device, weights)
         self.reward_std = float(dataset.rewards.std())
+        self.reward_range = float(dataset.rewards.min()), float(dataset.rewards.max())
+        lengths = dataset.episode_lengths
+        self.longest_recorded = int(lengths.max())
+        self.cut_short = not bool(dataset.terminated[dataset.episode_ends[lengths.argmax()] - 1])
 
     def rollouts(self, policy: Policy, generator: torch.Generator) -> Rollouts:
         """New branched rollouts under the policy's sampled actions, in fp32 whatever the precision around it.
@@ -59,6 +63,10 @@ class Imagination:
                 posterior=o.posterior,
                 generator=generator,
             )
+
+    def longest(self, otherwise: int) -> int:
+        """Steps of an episode: of the longest, if that was cut short; if it fell, others may last `otherwise`."""
+        return self.longest_recorded if self.cut_short else max(self.longest_recorded, otherwise)
 
     def charged(self, rollouts: Rollouts) -> Tensor:
         """(H, B) rewards less the penalty `weight * std(r) * u`, std(r) over the data; differentiable in the states."""

@@ -70,10 +70,22 @@ class BranchPoints:
         self.observations = Store(dataset, ("observations",), device)
         self.actions = Store(dataset, ("actions",), device)
         self.starts = torch.as_tensor(dataset.episode_starts[dataset.episode_index], device=device)
+        self.firsts = torch.as_tensor(dataset.episode_starts, device=device)  # (E,)
 
     def draw(self, count: int, history: int, generator: torch.Generator) -> Histories:
         """Rows drawn at random, each with up to `history` steps before it."""
         return self.at(self.rows.draw((count,), generator), history)
+
+    def draw_firsts(self, count: int, generator: torch.Generator) -> Tensor:
+        """(count,) rows that episodes begin with, all episodes alike."""
+        drawn = torch.randint(len(self.firsts), (count,), generator=generator, device=self.firsts.device)
+        return self.firsts[drawn]
+
+    def draw_with_firsts(self, count: int, history: int, share: float, generator: torch.Generator) -> Histories:
+        """As `draw`, but this share of the rows, in expectation, as `draw_firsts`."""
+        rows, firsts = self.rows.draw((count,), generator), self.draw_firsts(count, generator)
+        chosen = torch.rand(count, generator=generator, device=rows.device) < share
+        return self.at(torch.where(chosen, firsts, rows), history)
 
     def draw_stretches(self, count: int, history: int, length: int, generator: torch.Generator) -> Histories:
         """`length` rows from each of some stretches of as many consecutive steps.

@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.console import Console
 
-from envtf_lit.agents.combo import ImaginingOptions
+from envtf_lit.agents.combo import MixingOptions
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.agents.store import publish_policy
@@ -52,10 +52,11 @@ def train_policy(
     options, target = params.train_policy[name], root / POLICIES / name
     with run_stage(f"train_policy_{name}", params, root):
         algorithm = ALGORITHMS[algorithm_of(options)]
-        if isinstance(options, ImaginingOptions):
+        if isinstance(options, MixingOptions):
             options = within_reach(options, root / WORLD_MODELS / options.world_model)
         dataset = dataset_of(params, root)
-        data = transition_data(dataset, options, seed=params.seed, **unseen(params))
+        held_out = {"held_out": params.download.held_out} if algorithm.watches else unseen(params)
+        data = transition_data(dataset, options, seed=params.seed, **held_out)
         agent = algorithm(
             data.observation_dim,
             data.action_dim,
@@ -79,10 +80,10 @@ def train_policy(
             progress=progress,
             validate=False,
         ) as curves:
-            return publish_policy(target, agent.average_actor, curves, curves.rows[-1], settings)
+            return publish_policy(target, agent.average_actor, curves, curves.rows[-1], settings, agent.records())
 
 
-def within_reach(options: ImaginingOptions, model: Path) -> ImaginingOptions:
+def within_reach(options: MixingOptions, model: Path) -> MixingOptions:
     """The options with paths no longer than the world model's held-out reach, as its folder says; a note if that cuts.
 
     Args:

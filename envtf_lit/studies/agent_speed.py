@@ -19,9 +19,10 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from envtf_lit.agents.agent import Agent, follow
+from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.networks import StackedCritics
 from envtf_lit.agents.options import PolicyOptions
+from envtf_lit.agents.phases import follow
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.dataset import OfflineDataset

@@ -13,7 +13,7 @@ from torch import Tensor
 from envtf_lit import training
 from envtf_lit.data.datamodules import WindowData
 from envtf_lit.data.loaders import epoch_generator
-from envtf_lit.divergence import diverged
+from envtf_lit.divergence import Bound, diverged
 from envtf_lit.errors import UserError
 from envtf_lit.options.schema import build
 from envtf_lit.world_models.ensemble import EnsembleDynamics
@@ -27,6 +27,7 @@ SELECTION_SEGMENTS, SELECTION_HORIZON = 256, 20  # open-loop stretches by which 
 EPISTEMIC_TOKENS = 100_000  # training rows that epistemic variance is fitted to, at most
 CALIBRATION_EPISODES = 50  # held-out episodes that the predicted variances are scaled by, at most
 SINGULAR = "since hidden tokens are too large for its inverse"
+EXPLODED = 1e4  # a mean loss over z-scored targets
 IMPROVEMENT = 0.01  # of a member's held-out error, below which it counts as none
 
 
@@ -65,6 +66,7 @@ class LitWorldModel(L.LightningModule):
 
     Attributes:
         label: its name in messages.
+        bounds: of logged metrics; see `divergence.check_epoch`.
         monitor: logged name by which the best weights are selected, or None where the module selects them itself.
 
     Args:
@@ -79,6 +81,9 @@ class LitWorldModel(L.LightningModule):
 
     Options: ClassVar[type[WorldModelOptions]] = TransformerOptions
     label: ClassVar[str] = "The transformer"
+    bounds: ClassVar[Mapping[str, Bound]] = {
+        "train/loss": Bound(EXPLODED, "and a model that knows nothing has about 1")
+    }
     monitor: str | None = "val/open_loop_error"
 
     def __init__(
