@@ -1,6 +1,7 @@
 # Two commands are all the set-up there is: `make repro` and `make test`.
 #
 #   make repro PRESET=tiny      the whole pipeline in a temporary copy, in minutes
+#   make docs                   the site, built offline: reports/site/index.html
 #   make tutorials              the notebooks, executed: reports/notebooks/*.html
 #   make bench D3RLPY=PYTHON     speed of agents and model; a Python that has d3rlpy gives the ratios with it
 #   make … TORCH_INDEX=URL      another build of torch, such as https://download.pytorch.org/whl/cpu
@@ -27,10 +28,10 @@ PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check
 PINNED = $(PIP) $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) $(if $(LOCK),--no-build-isolation)
 TORCH = $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: help repro tutorials test test-all bench lint lock clean
+.PHONY: help repro tutorials test test-all docs bench lint lock clean
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -8
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -9
 
 repro: .venv/.installed .dvc/tmp/.ready
 ifeq ($(PRESET),)
@@ -53,6 +54,10 @@ test: .venv/.installed-dev
 
 test-all: .venv/.installed-dev
 	pytest -q -n auto -m "slow or not slow"
+
+docs: .venv/.installed-docs
+	sphinx-build --quiet --fail-on-warning --keep-going --doctree-dir .envtf/doctrees docs reports/site
+	@echo "Done: reports/site/index.html"
 
 bench: .venv/.installed-dev
 	envtf bench agents $(if $(D3RLPY),--d3rlpy $(D3RLPY)) --out reports/bench/agents.json
@@ -82,6 +87,10 @@ clean:
 
 .venv/.installed-dev: .venv/.installed
 	@$(PINNED) $(TORCH) --editable '.[dev]'
+	@touch $@
+
+.venv/.installed-docs: .venv/.installed
+	@$(PINNED) $(TORCH) --editable '.[docs]'
 	@touch $@
 
 # Written anew after any change of constraints.txt or of the dependencies. Torch is left out with all that its builds

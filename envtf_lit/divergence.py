@@ -13,6 +13,10 @@ CURES = {"": "lower learning_rate, or look for outliers with `envtf data check`"
 OVERFLOW = "so a value, a loss or a gradient has overflowed"
 
 
+class Diverged(UserError):
+    """A training that diverged: an outcome of the method and its settings, where other errors are of the use."""
+
+
 @dataclass(frozen=True)
 class Bound:
     """What a logged metric of a sound training stays below.
@@ -28,7 +32,7 @@ class Bound:
 
 def diverged(
     label: str, when: str, name: str, value: float, cause: str, cures: Mapping[str, str] = CURES, *, epoch: int = 1
-) -> UserError:
+) -> Diverged:
     """What to raise where a training diverged.
 
     Args:
@@ -41,7 +45,7 @@ def diverged(
     """
     kept = "" if epoch == 1 else " The epoch before is kept in the run's last checkpoint."
     cure = cures.get(name.rpartition("/")[2], cures[""])
-    return UserError(f"{label} diverged {when}: {name} is {value:.3g}, {cause}; {cure}.{kept}")
+    return Diverged(f"{label} diverged {when}: {name} is {value:.3g}, {cause}; {cure}.{kept}")
 
 
 def check_epoch(

@@ -8,6 +8,7 @@ import json
 import logging
 import platform
 import shutil
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -134,7 +135,8 @@ def trained(
         validate: run the validation loop after each epoch.
         mode: whether the least or the largest value of `monitor` is best.
         gradient_clip: largest gradient norm, for automatic optimisation alone.
-        callbacks: further ones.
+        callbacks: further ones; a `Checkpoint` among them is called before an epoch's checkpoint is written, so that
+            its state is in there, and not for an epoch that diverged.
 
     Raises:
         UserError: `target` or `run` cannot be written, before any training; or the training diverged.
@@ -144,12 +146,14 @@ def trained(
     check_writable(run / "last.ckpt", folder=False)
     checkpoint = _checkpoint(run, ("last",) if monitor is None else ("last", "best"))
     curves = Curves()
+    # in front the guard: an epoch that diverged is in no checkpoint
+    keepers = [Guard(), *callbacks, *_keepers(run, curves, monitor, mode)]
     trainer = L.Trainer(
         max_epochs=epochs,
         precision="bf16-mixed" if precision == "bf16" else "32-true",
         accelerator="auto",
         devices=1,
-        callbacks=[*callbacks, *_keepers(run, curves, monitor, mode), *([RichProgressBar()] if progress else [])],
+        callbacks=[*keepers, *([RichProgressBar()] if progress else [])],
         plugins=[WholeCheckpoints()],
         logger=False,
         enable_progress_bar=progress,
@@ -158,7 +162,10 @@ def trained(
         limit_val_batches=None if validate else 0,
         gradient_clip_val=gradient_clip,
     )
-    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    with warnings.catch_warnings():
+        # Lightning's use of an older torch's name helps nobody, least of all in a notebook
+        warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
+        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
     if monitor is not None:
@@ -169,15 +176,12 @@ def trained(
 
 
 def _keepers(run: Path, curves: Curves, monitor: str | None, mode: Literal["min", "max"]) -> list[Callback]:
-    """What writes `best.ckpt`, if there is something to monitor, and `last.ckpt`, which must hold the others' state.
-
-    In front the guard: an epoch that diverged is in neither.
-    """
+    """What writes `best.ckpt`, if there is something to monitor, and `last.ckpt`, which must hold the others' state."""
     last = ModelCheckpoint(dirpath=run, filename="last", enable_version_counter=False)
     if monitor is None:
-        return [Guard(), curves, last]
+        return [curves, last]
     best = ModelCheckpoint(dirpath=run, filename="best", monitor=monitor, mode=mode, enable_version_counter=False)
-    return [Guard(), best, curves, last]
+    return [best, curves, last]
 
 
 def _checkpoint(run: Path, names: Sequence[str]) -> Path | None:

@@ -26,9 +26,9 @@ from envtf_lit.world_models.forecast import Scale, whole_episodes
 HOPPER = ROBOTS["hopper"]
 LABELS = {"clone": "BC", "plain": "CQL", "dreamer": "ET + CQL"}
 LEARNED = {
-    "clone": {"algorithm": "bc", "world_model": None},
-    "plain": {"algorithm": "cql", "world_model": None},
-    "dreamer": {"algorithm": "et_cql", "world_model": "small"},
+    "clone": {"algorithm": "bc", "world_model": None, "effective_episodes": None},
+    "plain": {"algorithm": "cql", "world_model": None, "effective_episodes": 20.04},
+    "dreamer": {"algorithm": "et_cql", "world_model": "small", "effective_episodes": 7.8},
 }
 LEVELS = {"clone": 400.0, "plain": 900.0, "dreamer": 200.0}  # returns, of an experiment that went against us
 

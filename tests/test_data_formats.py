@@ -1,10 +1,10 @@
 """Files: round trips, D4RL's variants, and what stays on a full disk."""
 
-import resource
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -13,6 +13,7 @@ from logs import assert_equal, columns, write
 
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.errors import UserError
+from tests.full_disk import full_disk
 
 
 @pytest.fixture(params=[".h5", ".npz"])
@@ -151,10 +152,14 @@ def test_a_split_is_stored(tmp_path: Path, ending: str):
 
 def test_a_file_that_another_program_writes_is_no_damaged_one(tmp_path: Path):
     path = write(tmp_path / "in.h5", columns())
-    read = f"from envtf_lit.data.sources.files import load_dataset as load\nload({str(path)!r})"
-    with h5py.File(path, "r+"):
-        found = subprocess.run([sys.executable, "-c", read], capture_output=True, text=True, check=False)
-    assert "is open for writing in another program: close it there" in found.stderr
+    hold = f"import h5py\nwith h5py.File({str(path)!r}, 'r+'):\n    print('ready', flush=True)\n    input()"
+    pipes: dict[str, Any] = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    with subprocess.Popen([sys.executable, "-c", hold], **pipes) as writer:
+        assert writer.stdout is not None and writer.stdout.readline() == "ready\n"
+        with pytest.raises(UserError, match="is open for writing in another program: close it there"):
+            load_dataset(path)
+        writer.communicate("\n")
+    load_dataset(path)
 
 
 def test_missing_file_folder_and_ending(tmp_path: Path, ending: str):
@@ -172,13 +177,8 @@ def test_a_full_disk_leaves_the_old_file_whole(tmp_path: Path, ending: str):
     dataset = load_dataset(write(tmp_path / f"in{ending}", columns()))
     path = tmp_path / f"out{ending}"
     path.write_bytes(b"old")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, before[1]))  # every larger file fails as on a full disk
-    try:
-        with pytest.raises(UserError, match="No space left while writing"):
-            save_dataset(dataset, path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with full_disk(1_000), pytest.raises(UserError, match="No space left while writing"):
+        save_dataset(dataset, path)
     assert path.read_bytes() == b"old"
     assert len(list(tmp_path.iterdir())) == 2
 

@@ -68,7 +68,7 @@ def locked() -> dict[str, tuple[str, list[str]]]:
 
 def test_constraints_are_plain_versions_within_the_bounds() -> None:
     pinned = pins()
-    for requirement in dependencies("pipeline", "behaviour", "dev"):
+    for requirement in dependencies("pipeline", "behaviour", "docs", "dev"):
         assert requirement.specifier.contains(Version(pinned[canonicalize_name(requirement.name)])), requirement
 
 

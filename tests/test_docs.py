@@ -16,7 +16,8 @@ from envtf_lit.pipeline.yaml import dump_params, load_params
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+SITE_FRONT = DOCS / "index.md"  # that includes the README
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(set(DOCS.rglob("*.md")) - {SITE_FRONT})]
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
@@ -51,7 +52,15 @@ def test_every_page_is_reached_from_the_readme() -> None:
 
 def test_the_index_names_every_page_beside_it() -> None:
     listed = {path for path, _ in links(DOCS / "README.md")}
-    assert {page for page in DOCS.glob("*.md") if page.name != "README.md"} - listed == set()
+    beside = {*DOCS.glob("*.md"), *DOCS.glob("*/README.md"), DOCS / "api/index.rst"}
+    assert beside - listed == {DOCS / "README.md", SITE_FRONT}
+
+
+def test_addresses_elsewhere_are_whole() -> None:
+    found = [link for page in PAGES for link in LINK.findall(page.read_text()) if "://" in link]
+    assert found
+    odd = [link for link in found if not re.fullmatch(r"https://[\w-]+(\.[\w-]+)+(/[\w./?=&%+~#-]*)?", link)]
+    assert odd == []
 
 
 def test_the_readme_has_a_line_for_every_room_of_the_package() -> None:

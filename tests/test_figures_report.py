@@ -114,6 +114,16 @@ def test_estimates_are_never_called_scores(offline: Run):
     table = sentences.estimates_table(offline)
     assert list(table["known by"]) == ["record", *["imagination"] * 4]
     assert list(table["learned from"])[2:] == ["data", "data", "data, and rollouts in small"]
+    assert list(table["effective episodes"]) == ["", "", "", "20.0", "7.8"]
+
+
+def test_beside_each_score_stands_how_many_episodes_it_was_learned_from(lost: Run):
+    assert list(sentences.scores_table(lost)["effective episodes"]) == ["", "", "20.0", "7.8"]
+    older = {
+        name: {k: v for k, v in found.items() if k != "effective_episodes"} for name, found in lost.policies.items()
+    }
+    before = replace(lost, metrics=lost.metrics | {"policies": older})
+    assert list(sentences.scores_table(before)["effective episodes"]) == [""] * 4
 
 
 def test_critics_are_spoken_of_where_there_are_any(lost: Run):

@@ -1,81 +1,144 @@
-"""The pictures that only tutorials show: drawn whole, with the numbers behind them."""
+"""The tutorials' figures: written whole, the same bytes every time, with what they are drawn from beside them."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from PIL import Image
+from analytic import linear_data
+from matplotlib.figure import Figure
+from walker import walker_dataset
 
-from envtf_lit.evaluation.in_context import Doubt
-from envtf_lit.figures.frontier import frontiers
-from envtf_lit.figures.in_context import bodies_apart, change_curves, doubt_curves
-from envtf_lit.figures.pendulum import paths_in_worlds, swings, value_maps
+from envtf_lit.evaluation.coverage import visits
+from envtf_lit.evaluation.toy import Beliefs, toy_truth
+from envtf_lit.figures import attention, data, film, inline, objectives, uncertainty
+from envtf_lit.robots.tasks import ROBOTS
+from envtf_lit.world_models.forecast import whole_episodes
 
-ANGLE = np.linspace(-3.0, 3.0, 40)
+HOPPER = ROBOTS["hopper"]
+LINE = np.linspace(-2, 2, 9)
+BELIEFS = Beliefs(LINE, np.sin(LINE), np.full(9, 0.1), np.linspace(0, 1, 9))
+SPREADS = pd.DataFrame({"predicted": [0.1, 0.5], "observed": [0.2, 0.4]})
+QUARTILES = {"lower": [0.1, 0.1], "median": [0.2, 0.3], "upper": [0.4, 0.5]}
+STEPS = pd.DataFrame({"step": [1, 2], **QUARTILES, "running": [1, 0.5]})
+NOVELTIES = {"in": np.array([0.1, 0.5]), "out": np.array([2.0, 9.0])}
+MATRIX = np.array([[0.5, -np.inf], [1, 2]])
+PROMISES = pd.DataFrame({"speed": [2.0, 3.0], "promised": [1.0, 2.0], "true": [1.0, -50.0], "halted": [0.0, 0.9]})
+LOGS = {"whole": linear_data((30, 40)), "part": linear_data((20,))}
+SCORES = {"random": np.arange(5.0), "medium": np.arange(20.0)}
+GRID = (np.arange(4.0), np.arange(3.0), np.geomspace(0.1, 10, 12).reshape(3, 4))
 
-
-def colours(path: Path) -> set[tuple[int, int, int]]:
-    """All colours of a picture."""
-    with Image.open(path) as picture:
-        assert min(picture.size) > 200
-        return {colour for _, colour in picture.convert("RGB").getcolors(1 << 24) or []}  # pyright: ignore[reportReturnType]
-
-
-def rgb(colour: str) -> tuple[int, int, int]:
-    """A colour such as #D55E00 in numbers."""
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
-
-
-def table(path: Path) -> pd.DataFrame:
-    return pd.read_csv(path.with_suffix(".csv"))
-
-
-def test_bodies_and_their_change(tmp_path: Path) -> None:
-    found = {"nominal": np.zeros((6, 3)), "weak": np.ones((4, 3))}
-    apart = bodies_apart(found, "speed (m/s)", 1, tmp_path / "bodies.png")
-    assert table(apart).groupby("body")["value"].agg(["size", "mean"]).to_numpy().tolist() == [[6, 0], [4, 1]]
-    curves = {name: np.exp(np.random.default_rng(0).normal(size=(3, 9))) for name in ("transformer", "ensemble")}
-    change = change_curves(curves, 4, tmp_path / "change.png")
-    assert table(change).query("model == 'ensemble'")["median"].tolist() == pytest.approx(curves["ensemble"][1], 1e-5)
-    assert {rgb("#D55E00"), rgb("#0072B2")} <= colours(change)
-
-
-def test_doubt_is_a_panel_for_each_model(tmp_path: Path) -> None:
-    doubts = {name: Doubt(np.full(5, 0.2), np.full(5, 0.1)) for name in ("transformer", "ensemble")}
-    path = doubt_curves(doubts, tmp_path / "doubt.png")
-    assert len(table(path)) == 10 and colours(path)
-    with Image.open(path) as both, Image.open(doubt_curves({"ensemble": doubts["ensemble"]}, path)) as one:
-        assert both.size[0] > 1.5 * one.size[0]
-
-
-def test_swings_show_every_episode(tmp_path: Path) -> None:
-    path = swings({"one": ANGLE, "other": -ANGLE}, tmp_path / "swings.png", title="Two", step=0.05)
-    assert table(path).groupby("episode")["angle"].size().tolist() == [40, 40]
-    assert table(path)["time"].max() == pytest.approx(39 * 0.05)
-    assert len(colours(path)) > 50
+DRAWN: dict[str, Callable[[Path], object]] = {
+    "coverage": lambda path: data.coverage_maps(visits(LOGS, (0, 1), bins=4), None, 3, path),
+    "quality": lambda path: data.quality_and_coverage(SCORES, {"random": 0.2, "medium": 0.6}, path),
+    "guesses": lambda path: data.guesses({"a": (LINE, LINE), "b": (LINE, 0 * LINE)}, "return", path),
+    "steps back": lambda path: attention.steps_back(np.full((2, 3, 4), 0.25), path),
+    "objectives": lambda path: objectives.objective_curves(["nll", "paper_mse"], (0.1, 1.0), path),
+    "beliefs": lambda path: uncertainty.beliefs_on_a_line({"m": BELIEFS}, (LINE, LINE), toy_truth(LINE)[0], path),
+    "reliability": lambda path: uncertainty.reliability_plot({"m": SPREADS}, path),
+    "novelties": lambda path: uncertainty.novelty_curves(
+        {"in": np.array([0.1, 0.5]), "out": np.array([2.0, 9.0])}, path
+    ),
+    "cut": lambda path: uncertainty.cut_rollouts({"all": STEPS, "cut": STEPS}, path),
+    "promises": lambda path: uncertainty.promise_and_truth(PROMISES, 2.5, path),
+}
+PICTURES: dict[str, Callable[[Path], object]] = {
+    "maps": lambda path: attention.attention_maps(np.full((2, 2, 6, 6), 0.2), path),
+    "matrices": lambda path: attention.small_matrices([("m", MATRIX)], path, ticks=["a", "b"]),
+    "novelty": lambda path: uncertainty.novelty_over_states(GRID, np.zeros((5, 11)), (0, 5), "hopper", path),
+    "film": lambda path: film.film_strip({"real": walker_dataset(1).observations}, HOPPER, [0, 9], path, title="t"),
+}
 
 
-def test_a_line_breaks_where_the_pendulum_passes_the_bottom(tmp_path: Path) -> None:
-    turning = (np.linspace(0, 4 * np.pi, 60) + np.pi) % (2 * np.pi) - np.pi
-    straight = swings({"a": turning}, tmp_path / "a.png", title="", step=0.05)
-    assert table(straight)["angle"].notna().all()  # the numbers have no gaps
+@pytest.mark.parametrize("name", [*DRAWN, *PICTURES])
+def test_a_figure_is_drawn_with_the_same_bytes_twice(name: str, tmp_path: Path) -> None:
+    for time in ("first", "second"):
+        (tmp_path / time).mkdir()
+        (DRAWN | PICTURES)[name](tmp_path / time / "f.png")
+    first, second = (sorted((tmp_path / time).iterdir()) for time in ("first", "second"))
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+    assert [path.name for path in first] == (["f.csv", "f.png"] if name in DRAWN else ["f.png"])
 
 
-def test_two_worlds_are_drawn_in_a_panel_for_each_plan(tmp_path: Path) -> None:
-    found = {"true": np.stack([ANGLE, ANGLE]), "learned": np.stack([ANGLE + 0.1, ANGLE])}
-    path = paths_in_worlds(found, tmp_path / "paths.png", step=0.05, title="Two worlds")
-    assert len(table(path)) == 2 * 2 * 40
-    values = {"true": np.arange(12.0).reshape(4, 3), "learned": np.zeros((4, 3))}
-    maps = value_maps(values, (-np.pi, -8.0), (np.pi, 8.0), tmp_path / "values.png", title="Worth")
-    assert len(table(maps)) == 24 and len(colours(maps)) > 50
+@contextmanager
+def caught(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Figure]]:
+    """The figures that are written while it lasts."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **how: (figures.append(figure), Path(path).touch()))
+    yield figures
 
 
-def test_a_frontier_rings_who_was_published(tmp_path: Path) -> None:
-    rows = dict(update=[0, 1], excess=[0.0, 0.1], promise=[10.0, 20.0], error=[1.0, 2.0], lost=[0.0, 0.0], kept=[0, 1])
-    found = {"default": pd.DataFrame(rows), "bold": pd.DataFrame(rows)}
-    promised = colours(frontiers(found, tmp_path / "promised.png"))
-    path = frontiers(found, tmp_path / "true.png", truths={"bold": np.array([5.0, 7.0])})
-    assert table(path)["run"].tolist() == ["default"] * 2 + ["bold"] * 2
-    truth = rgb("#0072B2")
-    assert truth in colours(path) and truth not in promised
+def test_axes_have_names_and_units(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with caught(monkeypatch) as figures:
+        for draw in DRAWN.values():
+            draw(tmp_path / "f.png")
+    for figure in figures:
+        assert any(axis.get_xlabel() for axis in figure.axes) and any(axis.get_ylabel() for axis in figure.axes)
+        assert all(axis.has_data() for axis in figure.axes)
+
+
+def test_objectives_are_least_where_their_dots_are() -> None:
+    for error in (0.1, 0.3, 1.0):
+        assert objectives.best_spread("nll", error) == pytest.approx(error, rel=0.06)
+        assert objectives.best_spread("paper_mse", error) == objectives.SPREADS[0]
+    loss = objectives.expected_loss("paper_mse", 0.5, np.array([0.1, 1.0]))
+    np.testing.assert_allclose(loss, [0.25 + 0.01, 0.25 + 1.0], rtol=0.03)
+
+
+def test_a_film_has_no_picture_of_what_is_over_or_not_finite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    long, lost = walker_dataset(1).observations, walker_dataset(1).observations.copy()
+    lost[5:] = np.nan
+    strips = {"long": long, "short": long[:6], "lost": lost}
+    with caught(monkeypatch) as figures:
+        film.film_strip(strips, HOPPER, [0, 4, 9], tmp_path / "f.png", title="three")
+    shown = [len(axis.images) for axis in figures[0].axes]
+    assert shown == [1, 1, 1, 1, 1, 0, 1, 1, 0]
+    assert film.spread_steps(9, 3) == [0, 4, 9] and film.spread_steps(1) == [0, 1]
+
+
+def test_a_recorded_trajectory_becomes_an_episode() -> None:
+    log = walker_dataset(2)
+    episode = film.recorded_episode(whole_episodes(log, 2, seed=0), 1, HOPPER)
+    np.testing.assert_array_equal(episode.observations[:-1], log.observations[20:])
+    np.testing.assert_array_equal(episode.observations[-1], log.next_observations[-1])
+    np.testing.assert_array_equal(episode.positions[:, 1:], episode.observations[:, :5])
+    walked = 0.008 * episode.observations[1:, 5].cumsum()  # seconds of a step, and x velocities
+    np.testing.assert_allclose(episode.positions[1:, 0], walked, atol=1e-6)
+
+
+# what notebooks show
+
+
+def displayed(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What is displayed from now on."""
+    shown: list[Any] = []
+    monkeypatch.setattr(inline, "display", shown.append)
+    return shown
+
+
+def test_sentences_sources_and_figures_are_displayed(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = displayed(monkeypatch)
+    inline.say("One.", "", "Two.")
+    inline.show_source(film.spread_steps)
+    inline.draw(uncertainty.reliability_plot, {"m": SPREADS}, alt="a line")
+    assert shown[0].data == "One. Two."
+    assert shown[1].data.startswith("```python\ndef spread_steps") and '"""' not in shown[1].data
+    assert shown[2].data.startswith('<img alt="a line" src="data:image/png;base64,')
+
+
+def test_printed_is_plain_text(capsys: pytest.CaptureFixture[str]) -> None:
+    inline.show_printed("[bold]as it is[/bold]", "second")
+    assert capsys.readouterr().out.split() == ["[bold]as", "it", "is[/bold]", "second"]
+
+
+def test_a_folder_is_made_and_entered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    inline.enter_folder("new/one")
+    assert Path.cwd() == tmp_path / "new/one"
+    inline.enter_folder("")
+    assert Path.cwd().name.startswith("envtf-tutorial-") and not any(Path.cwd().iterdir())
+    Path.cwd().rmdir()
+    monkeypatch.chdir(tmp_path)

@@ -1,5 +1,7 @@
 """The real-versus-imagined video: with whatever GL there is, and without any."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from PIL import Image
 from envtf_lit.errors import UserError
 from envtf_lit.figures import video
 from envtf_lit.policy import RandomPolicy
+from envtf_lit.robots.render import GHOST, draw_with_ghost
 from envtf_lit.robots.returns import Episode, evaluate_policy
 from envtf_lit.robots.tasks import ROBOTS, Robot, get_task
 from envtf_lit.world_models.forecast import Scale
@@ -61,6 +64,21 @@ def test_links_are_drawn_without_gl(episode):
     robot = (np.abs(first.astype(int) - (204, 153, 102)).max(-1) < 12).mean()  # the model's own colour
     assert 0.01 < robot < 0.2
     assert (first != last).any(-1).mean() > 0.01
+
+
+def test_a_ghost_stands_behind_the_robot_where_the_model_errs(episode, tmp_path):
+    path = tmp_path / "ghost.gif"
+    video.ghost_over_real(still_world(), episode, HOPPER, SCALE, path, frames=5)
+    with Image.open(path) as movie:
+        assert movie.size == (video.GHOST_SIZE, video.GHOST_SIZE + 2 * video.HEADER) and getattr(movie, "n_frames") == 5  # noqa: B009
+        movie.seek(4)
+        last = np.asarray(movie.convert("RGB")).astype(int)
+    simulator: Any = HOPPER.make().unwrapped
+    model, pose = simulator.model, episode.positions[:1]
+    apart = pose + np.eye(1, pose.shape[1])  # a metre ahead
+    pale = lambda frame: int((np.abs(frame.astype(int) - GHOST).sum(-1) < 30).sum())  # noqa: E731
+    alone, both = (draw_with_ghost(model, pose, other, 96)[0] for other in (pose, apart))
+    assert pale(both) > 5 * max(1, pale(alone)) and last.std() > 1.0
 
 
 def test_video_shows_both_sides(episode, tmp_path):

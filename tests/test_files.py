@@ -15,9 +15,12 @@ import pytest
 import torch
 
 from envtf_lit.actors import TanhGaussianActor
+from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.files import recover, replacing, write_json, write_text
 from envtf_lit.policy import load_policy, save_policy
+from tests.full_disk import full_disk
+from tests.walker import walker_dataset
 
 
 @pytest.fixture
@@ -64,45 +67,21 @@ def test_a_file_never_takes_the_place_of_a_folder_nor_a_folder_that_of_a_file(po
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "policy"]
 
 
-FULL_DISK = """
-import os, resource
-from pathlib import Path
-import torch
-from envtf_lit.data.sources.files import save_dataset
-from envtf_lit.errors import UserError
-from envtf_lit.actors import TanhGaussianActor
-from envtf_lit.policy import save_policy
-from envtf_lit.files import write_json
-from tests.walker import walker_dataset
-
-dataset, actor = walker_dataset(episodes=100), TanhGaussianActor(30, 20)
-save_policy("policy", TanhGaussianActor(3, 2, hidden=(8,)))
-before = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
-resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # every larger file fails as on a full disk
-writers = {
-    "a model": lambda: save_policy("policy", actor),
-    "JSON": lambda: write_json("numbers.json", list(range(10_000))),
-    "HDF5": lambda: save_dataset(dataset, "data.h5"),
-    "NPZ": lambda: save_dataset(dataset, "data.npz"),
-}
-for name, write in writers.items():
-    try:
-        write()
-    except UserError as error:
-        assert str(error).startswith("No space left while writing"), error
-    else:
-        raise SystemExit(f"{name} was written whole")
-assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before
-"""
-
-
-def test_a_full_disk_leaves_what_was_there(tmp_path: Path, repository: Path) -> None:
-    pytest.importorskip("resource")
-    environment = os.environ | {"PYTHONPATH": str(repository)}
-    child = subprocess.run(
-        [sys.executable, "-c", FULL_DISK], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
-    assert child.returncode == 0, child.stderr
+def test_a_full_disk_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    dataset, actor = walker_dataset(episodes=100), TanhGaussianActor(30, 20)
+    save_policy("policy", TanhGaussianActor(3, 2, hidden=(8,)))
+    before = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+    writers: list[Callable[[], None]] = [
+        lambda: save_policy("policy", actor),
+        lambda: write_json("numbers.json", list(range(10_000))),
+        lambda: save_dataset(dataset, "data.h5"),
+        lambda: save_dataset(dataset, "data.npz"),
+    ]
+    for write in writers:
+        with full_disk(20_000), pytest.raises(UserError, match=r"^No space left while writing"):
+            write()
+    assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before
 
 
 # what stands there while something else takes its place

@@ -161,10 +161,19 @@ def test_metrics_hold_no_score_and_only_finite_numbers(finished: tuple[Path, Par
         "cql": None,
         "et_cql": "transformer",
     }
-    names = {"label", "algorithm", "world_model", "imagined_return_mean", "imagined_return_std", "action_error"}
+    names = {
+        "label",
+        "algorithm",
+        "world_model",
+        "imagined_return_mean",
+        "imagined_return_std",
+        "action_error",
+        "effective_episodes",
+    }
     assert all(set(policy) == names for policy in metrics["policies"].values())
     assert metrics["held_out"]["episodes"] == 2  # of the three held out, one scales the predicted intervals
     assert metrics["policies"]["bc"]["action_error"] > 0
+    assert all(policy["effective_episodes"] > 1 for policy in metrics["policies"].values())
     assert metrics["world_model"]["termination"] == "learned"
     card = json.loads((root / "data/dataset.json").read_text())
     assert card["task"] is None and "scores" not in card

@@ -1,12 +1,20 @@
 """Open-loop and teacher-forced errors against a linear world whose errors are known."""
 
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
-from analytic import linear_data, linear_world
+from analytic import LinearWorld, linear_data, linear_world
+from torch import Tensor
 
+from envtf_lit.data.datamodules import WindowData
+from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.horizon import error_quartiles, horizon_report
+from envtf_lit.world_models.fit import reach
 from envtf_lit.world_models.forecast import (
     Scale,
     forecast,
@@ -190,3 +198,26 @@ def test_the_median_reach_takes_ends_for_unknown(bad, lengths, expected):
         if steps is not None:
             error[row, steps:] = 1.0
     assert median_steps_within(error, torch.tensor(lengths), 0.1) == expected
+
+
+@dataclass
+class LearnedWorld(LinearWorld):
+    """With parameters, as of a module, to tell the device by."""
+
+    def parameters(self) -> Iterator[Tensor]:
+        return iter([self.matrix])
+
+
+def test_the_reach_is_that_of_the_validation_episodes_whatever_those_for_testing_hold(tmp_path: Path):
+    data, found = linear_data((60,) * 12).with_split(0.5, 0), []
+    assert data.held_out is not None
+    for_testing = np.isin(data.episode_index, np.flatnonzero(data.held_out)[::2])
+    strange = np.random.default_rng(0).normal(size=data.next_observations.shape).astype(np.float32)
+    spoiled = np.where(for_testing[:, None], strange, data.next_observations[:])
+    for number, log in enumerate((data, replace(data, next_observations=spoiled))):
+        save_dataset(log, tmp_path / f"{number}.npz")
+        windows = WindowData(str(tmp_path / f"{number}.npz"))
+        windows.setup("fit")
+        model = linear_world(error=0.02)
+        found.append(reach(LearnedWorld(model.matrix, model.gain), windows, seed=0))
+    assert found[0] == found[1] and 1 < found[0] < 60

@@ -20,9 +20,10 @@ class ConservativeOptions(PolicyOptions):
     """Options of the conservative term.
 
     Attributes:
-        cql_weight: weight of the conservative term. In units of Q as the critics learn it, which `normalise_returns`
-            divides by the return scale (the spread of the log's returns): a published weight of w on plain rewards is
-            w / scale.
+        cql_weight: weight of the conservative term, beside half of the squared error (the paper's; public code has the
+            whole, so that a weight of theirs is half as much here). In units of Q as the critics learn it, which
+            `normalise_returns` divides by the return scale (the spread of the log's returns): a weight of w on plain
+            rewards is w / scale.
         cql_temperature: of the log-sum-exp, in the same units, so that 1 is one spread of the log's returns: actions
             that differ by far less count alike, and the term pushes their mean down. Published is 1 in plain rewards:
             1 / scale here, with which little but the best of the proposals counts.
@@ -36,7 +37,14 @@ class ConservativeOptions(PolicyOptions):
 
 @dataclass(frozen=True)
 class CQLOptions(ConservativeOptions, SACOptions):
-    """Conservative Q-Learning has the options of its term, and soft actor-critic's."""
+    """Conservative Q-Learning has the options of its term, and soft actor-critic's.
+
+    Attributes:
+        clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log; of
+            the mean over action dimensions. Ours: published is 0.
+    """
+
+    clone_weight: NonNegative = 0.75
 
 
 class CQL(SAC):

@@ -30,7 +30,6 @@ class ModelBasedOptions(SACOptions):
     """
 
     world_model: str = "ensemble"
-    clone_weight: NonNegative = 0.0
 
     real_ratio: NonzeroShare = 0.05
     refresh_every: Natural = 1_000

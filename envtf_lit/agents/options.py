@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from envtf_lit.data.loaders import UPDATES_PER_STEP
+from envtf_lit.data.options import UPDATES_PER_STEP
 from envtf_lit.errors import UserError
 from envtf_lit.options.numbers import Count, NonNegative, NonzeroShare, Positive, Share
 from envtf_lit.options.schema import check_epochs, rare

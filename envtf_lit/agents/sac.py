@@ -22,10 +22,10 @@ class SACOptions(PolicyOptions):
 
     Attributes:
         clone_weight: weight in the actor's objective of cloning the real rows' actions, which keeps it near the log; of
-            the mean over action dimensions.
+            the mean over action dimensions. Published is 0.
     """
 
-    clone_weight: NonNegative = 0.75
+    clone_weight: NonNegative = 0.0
 
 
 class Temperature(nn.Module):
@@ -37,7 +37,7 @@ class Temperature(nn.Module):
 
 
 class SAC(ActorCritic):
-    """Soft Actor-Critic on a log."""
+    """Soft Actor-Critic."""
 
     Options: ClassVar[type[PolicyOptions]] = SACOptions
     label = "SAC"

@@ -69,6 +69,12 @@ COMMANDS = {
     "bench planning": Command(
         "planning", "Planners on a pendulum: through a model learned from random steps, and through the truth", _KEPT
     ),
+    "compare run": Command(
+        "comparison",
+        "Train and score every algorithm on every task, robot by tier by seed; what is done already stays",
+        "The same command goes on with the runs that are not finished.",
+    ),
+    "compare report": Command("comparison", "Write tables and figures of what compare run has found"),
     "plan": Command("planning", "Play a planner in MuJoCo: it searches a world model at every step"),
     "export policy": Command("export", "Write a policy as ONNX or torch.export: observation to action"),
     "export model": Command(
@@ -85,5 +91,6 @@ GROUPS = {
     "zoo": "Datasets of four robots from behaviour policies that come along: list, build, or train your own",
     "export": "Write a policy or a world model as a file that runs without this package",
     "policy": "Ask a policy for actions",
+    "compare": "Compare every algorithm on every task, and report it",
     "bench": "Measure the speed of world model and agents and what accuracy costs, beside what they would replace",
 }

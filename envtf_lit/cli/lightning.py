@@ -22,8 +22,7 @@ from envtf_lit.cli.saved_options import (
     model_kind,
     policy_architecture,
 )
-from envtf_lit.data.loaders import UPDATES_PER_STEP
-from envtf_lit.data.options import DownloadOptions
+from envtf_lit.data.options import UPDATES_PER_STEP, DownloadOptions
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.options.schema import build
 from envtf_lit.pipeline.params import Params

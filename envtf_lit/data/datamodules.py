@@ -10,7 +10,6 @@ from torch.utils.data import DataLoader, Dataset
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.loaders import (
-    UPDATES_PER_STEP,
     DrawnRows,
     DrawSampler,
     Resamples,
@@ -20,6 +19,7 @@ from envtf_lit.data.loaders import (
     effective_episodes,
     epoch_generator,
 )
+from envtf_lit.data.options import UPDATES_PER_STEP
 from envtf_lit.data.sources.files import load_dataset
 
 

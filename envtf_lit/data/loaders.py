@@ -19,7 +19,6 @@ from envtf_lit.data.columns import Column, FileRows, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 
 BISECTIONS = 30  # of a temperature
-UPDATES_PER_STEP = 10  # gradient steps of an agent per Lightning training step: no host synchronisation between them
 
 
 def epoch_generator(seed: int, epoch: int, stream: str, device: torch.device | str = "cpu") -> torch.Generator:

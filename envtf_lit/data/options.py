@@ -1,10 +1,14 @@
-"""The options of the stage `download`."""
+"""The options of the stage `download`, and what those of agents rest on."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 from envtf_lit.errors import UserError
 from envtf_lit.options.numbers import InnerShare, Rows
+
+# gradient steps of an agent per Lightning training step: no host synchronisation between them. Here and not beside
+# what loads them, because options are read without torch
+UPDATES_PER_STEP = 10
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,12 @@ class HorizonReport:
     open_loop_nmse: Tensor
     teacher_forced_nmse: Tensor
 
+    @property
+    def median_row(self) -> int:
+        """The trajectory of median quality: by the steps within nmse 0.1, open loop."""
+        within, _ = steps_within(self.open_loop_nmse, self.trajectories.lengths, 0.1)
+        return int(within.argsort(stable=True)[(len(within) - 1) // 2])
+
 
 def horizon_report(
     model: WorldModel, trajectories: Trajectories, scale: Scale, *, thresholds: Sequence[float] = THRESHOLDS

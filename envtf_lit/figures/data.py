@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.colors import LogNorm
 
-from envtf_lit.data.coverage import Visits
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.evaluation.coverage import Visits
 from envtf_lit.figures.style import LINES, drawing, featured, observation_labels, write_table
 from envtf_lit.figures.zoo import TIER_COLOURS
 

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from envtf_lit.figures.style import drawing
+from envtf_lit.robots.returns import Episode
 from envtf_lit.robots.silhouette import Silhouette
 from envtf_lit.robots.tasks import Robot
+from envtf_lit.world_models.forecast import Trajectories
 
 SIZE = 200  # pixels of a picture
 
@@ -46,6 +48,19 @@ def film_strip(
             axis.set_title(f"step {step}", fontsize="medium")
         figure.suptitle(title)
     return Path(path)
+
+
+def recorded_episode(trajectories: Trajectories, row: int, robot: Robot) -> Episode:
+    """A recorded trajectory as an episode that can be shown; where on the plane the robot is, is integrated."""
+    length = int(trajectories.lengths[row])
+    targets = trajectories.targets[row, :length].cpu().numpy()
+    observations = np.concatenate([trajectories.observations[row, :1].cpu().numpy(), targets[:, :-1]])
+    artist = Silhouette(robot)
+    positions = [artist.start(observations[0])]
+    for observation in observations[1:]:
+        positions.append(artist.follow(positions[-1], observation))
+    actions = trajectories.actions[row, :length].cpu().numpy()
+    return Episode(-1, observations, actions, targets[:, -1].astype(np.float64), np.stack(positions))
 
 
 def _pictures(artist: Silhouette, observations: np.ndarray, steps: Sequence[int]) -> dict[int, np.ndarray]:

@@ -1,10 +1,13 @@
 """What notebooks show: sentences, tables, pictures, and figures that are drawn on the spot."""
 
 import base64
+import inspect
 import os
+import re
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 import pandas as pd
@@ -22,6 +25,13 @@ def say(*sentences: str) -> None:
 def show(table: pd.DataFrame) -> None:
     """Displays a table of text, without row numbers."""
     display(HTML(table.to_html(index=False, border=0)))
+
+
+def show_source(thing: Any) -> None:
+    """Displays the source of a function or class of ours, without its docstring."""
+    source = dedent(inspect.getsource(thing))
+    source = re.sub(r'^( *)""".*?"""\n+', "", source, count=1, flags=re.DOTALL | re.MULTILINE)
+    display(Markdown(f"```python\n{source}```"))
 
 
 def show_picture(path: Path, text: str) -> None:

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import torch
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from envtf_lit.evaluation.calibration import coverage
@@ -110,7 +109,7 @@ def traces(report: HorizonReport, robot: str | None, path: str | Path, *, steps:
     """
     lengths = report.trajectories.lengths
     within, _ = steps_within(report.open_loop_nmse, lengths, 0.1)
-    row = int(torch.argsort(within, stable=True)[(len(within) - 1) // 2])
+    row = report.median_row
     end = min(int(lengths[row]), steps)
     recorded, mean, std = (
         x[row, :end].cpu().numpy()

@@ -14,10 +14,10 @@ from envtf_lit.files import read_json
 def scores_table(run: Run) -> pd.DataFrame:
     """The data's mean and each policy's, as they did in the simulator."""
     spread = "standard deviation over episodes"
-    rows = [{"": "dataset, mean episode", run.unit: run.number(run.recorded), spread: "", "learned from": ""}]
+    rows = [{"": "dataset, mean episode", run.unit: run.number(run.recorded), spread: ""} | NOTHING]
     for name in run.policies:
         values = {run.unit: run.number(run.mean(name)), spread: run.number(run.std(name))}
-        rows.append({"": run.label(name)} | values | {"learned from": _learned_from(run, name)})
+        rows.append({"": run.label(name)} | values | _learned_from(run, name))
     return pd.DataFrame(rows)
 
 
@@ -27,18 +27,25 @@ def estimates_table(run: Run) -> pd.DataFrame:
     known = [("recorded, held out", held_out["return_mean"], "record")]
     known += [("model, on the recorded actions", held_out["imagined_return_mean"], "imagination")]
     rows = [
-        {"": what, "return": run.number(value), "known by": by, "action error": "", "learned from": ""}
+        {"": what, "return": run.number(value), "known by": by, "action error": ""} | NOTHING
         for what, value, by in known
     ]
     for name, found in run.policies.items():
         values = {"return": run.number(run.mean(name)), "known by": "imagination"}
-        values |= {"action error": f"{found['action_error']:.3g}", "learned from": _learned_from(run, name)}
-        rows.append({"": run.label(name)} | values)
+        values |= {"action error": f"{found['action_error']:.3g}"}
+        rows.append({"": run.label(name)} | values | _learned_from(run, name))
     return pd.DataFrame(rows)
 
 
-def _learned_from(run: Run, policy: str) -> str:
-    return f"data, and rollouts in {run.policies[policy]['world_model']}" if run.imagines(policy) else "data"
+NOTHING = {"learned from": "", "effective episodes": ""}  # of what did not learn
+
+
+def _learned_from(run: Run, policy: str) -> dict[str, str]:
+    """Its data, and how many episodes their rows come from, each counted by its share (see docs/metrics.md)."""
+    found = run.policies[policy]
+    source = f"data, and rollouts in {found['world_model']}" if run.imagines(policy) else "data"
+    episodes = found.get("effective_episodes")  # lacks in the metrics of an earlier version
+    return {"learned from": source, "effective episodes": "" if episodes is None else f"{episodes:.1f}"}
 
 
 def about_scores(run: Run) -> str:

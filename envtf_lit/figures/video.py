@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from envtf_lit.errors import UserError
 from envtf_lit.figures.style import COLOURS
 from envtf_lit.files import replacing
+from envtf_lit.robots.render import draw_with_ghost
 from envtf_lit.robots.returns import Episode
 from envtf_lit.robots.tasks import ROBOTS, Robot
 from envtf_lit.world_models.forecast import Scale, Trajectories, forecast, nmse
@@ -24,7 +25,7 @@ BACKENDS = ("egl", "osmesa", "disabled")  # of MUJOCO_GL, best first; without an
 MOST_FRAMES = 150
 STRIDE = 2  # simulated steps per frame
 FRAME_MILLISECONDS = 40
-SIZE, HEADER = 240, 24  # pixels
+SIZE, GHOST_SIZE, HEADER = 240, 360, 24  # pixels
 TIMEOUT = 300.0  # seconds; a renderer that hangs counts as missing
 
 
@@ -53,17 +54,38 @@ def real_vs_imagined(
         raise UserError(
             f"A video has 1 to {MOST_FRAMES} frames: {frames} were asked for; change evaluate.video_frames."
         )
-    steps = min(len(episode.actions), STRIDE * (frames - 1))
-    states, error = _imagine(model, episode, scale, max(steps, 1))
-    shown = np.arange(0, steps + 1, STRIDE)
-    imagined = imagined_positions(robot, states, episode.positions[0])
-    poses = np.concatenate([episode.positions[shown], imagined[shown]])
+    shown, real, imagined, error = _both(model, episode, robot, scale, frames)
     backend = working_backend()
-    pictures = _render(robot, poses, SIZE, backend)
+    pictures = _render(robot, np.concatenate([real, imagined]), SIZE, backend)
     pairs = zip(pictures[: len(shown)], pictures[len(shown) :], shown, strict=True)
     lost = np.maximum.accumulate(error) > 0.1  # from the first passage on
     write_gif([_page(real, fake, int(h), float(error[h]), bool(lost[h])) for real, fake, h in pairs], path)
     return backend
+
+
+def ghost_over_real(
+    model: WorldModel, episode: Episode, robot: Robot, scale: Scale, path: str | Path, *, frames: int = MOST_FRAMES
+) -> None:
+    """Writes a GIF of the real robot in front of the imagined one, a pale ghost; arguments as of `real_vs_imagined`.
+
+    Both begin in the same state and take the same actions; the picture moves with the real one. Drawn without GL.
+    """
+    shown, real, imagined, error = _both(model, episode, robot, scale, frames)
+    pictures = draw_with_ghost(_simulator(robot).model, real, imagined, GHOST_SIZE)
+    lost = np.maximum.accumulate(error) > 0.1
+    captions = [_caption(int(h), float(error[h]), bool(lost[h])) for h in shown]
+    write_gif([_captioned(picture, *caption) for picture, caption in zip(pictures, captions, strict=True)], path)
+
+
+def _both(
+    model: WorldModel, episode: Episode, robot: Robot, scale: Scale, frames: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Steps (F,) that are shown, real and imagined poses (F, Q) there, and the error (steps + 1,) of all steps."""
+    steps = min(len(episode.actions), STRIDE * (frames - 1))
+    states, error = _imagine(model, episode, scale, max(steps, 1))
+    shown = np.arange(0, steps + 1, STRIDE)
+    imagined = imagined_positions(robot, states, episode.positions[0])
+    return shown, episode.positions[shown], imagined[shown], error
 
 
 def no_video(folder: Path) -> None:
@@ -145,8 +167,23 @@ def _page(real: np.ndarray, imagined: np.ndarray, step: int, error: float, lost:
     middle = {"anchor": "mm", "font": font}
     pen.text((width / 2, HEADER / 2), "real (MuJoCo)", fill="black", **middle)
     pen.text((1.5 * width + 4, HEADER / 2), "imagined (world model)", fill="black", **middle)
+    note, colour = _caption(step, error, lost)
+    pen.text((width + 2, height + 1.5 * HEADER), note, fill=colour, **middle)
+    return page
+
+
+def _caption(step: int, error: float, lost: bool) -> tuple[str, str]:
     note = f"step {step}    normalised squared error {min(error, 999):.3g}" + ("  (has passed 0.1)" if lost else "")
-    pen.text((width + 2, height + 1.5 * HEADER), note, fill=COLOURS["imagined"] if lost else "black", **middle)
+    return note, COLOURS["imagined"] if lost else "black"
+
+
+def _captioned(picture: np.ndarray, note: str, colour: str) -> Image.Image:
+    height, width, _ = picture.shape
+    page = Image.new("RGB", (width, height + 2 * HEADER), "white")
+    page.paste(Image.fromarray(picture), (0, HEADER))
+    pen, middle = ImageDraw.Draw(page), {"anchor": "mm", "font": ImageFont.load_default(12)}
+    pen.text((width / 2, HEADER / 2), "real, and as a ghost what is imagined", fill="black", **middle)
+    pen.text((width / 2, height + 1.5 * HEADER), note, fill=colour, **middle)
     return page
 
 

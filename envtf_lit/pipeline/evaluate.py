@@ -13,7 +13,7 @@ from envtf_lit.evaluation.horizon import horizon_report
 from envtf_lit.evaluation.metrics import collect_metrics, collect_offline_metrics, world_model_metrics
 from envtf_lit.evaluation.offline import evaluate_offline
 from envtf_lit.figures import gallery
-from envtf_lit.figures.video import no_video, real_vs_imagined
+from envtf_lit.figures.video import ghost_over_real, no_video, real_vs_imagined
 from envtf_lit.files import check_plain, replacing, write_json
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.dataset import dataset_of
@@ -88,14 +88,17 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
                 gallery.draw_scores(dataset, source, robot, returns, _labels(params), plots)
                 episode, gif = list(returns.values())[-1].median, video / "real_vs_imagined.gif"
                 real_vs_imagined(model, episode, robot, scale, gif, frames=options.video_frames)
+                ghost_over_real(model, episode, robot, scale, video / "ghost.gif", frames=options.video_frames)
         for policy, options in params.train_policy.items():
             imagined_in = None if options.world_model == NO_WORLD_MODEL else options.world_model
             metrics["policies"][policy] |= {"algorithm": algorithm_of(options), "world_model": imagined_in}
+            metrics["policies"][policy]["effective_episodes"] = _last(curves[policy], EFFECTIVE)
         write_json(root / METRICS, metrics)
     return metrics
 
 
 MOST_CURVES = 16 << 20  # bytes
+EFFECTIVE = "train/effective_episodes"  # a column of a policy's curves
 
 
 def _labels(params: Params) -> dict[str, str]:
@@ -103,6 +106,12 @@ def _labels(params: Params) -> dict[str, str]:
     labels = {name: ALGORITHMS[algorithm_of(options)].label for name, options in params.train_policy.items()}
     found = list(labels.values())
     return {name: label if found.count(label) == 1 else f"{label}: {name}" for name, label in labels.items()}
+
+
+def _last(curves: pd.DataFrame, column: str) -> float | None:
+    """A column's last number; None where there is none, as in curves of an earlier version."""
+    logged = curves[column].dropna() if column in curves else ()
+    return float(logged.iloc[-1]) if len(logged) else None
 
 
 def _curves(folder: Path) -> pd.DataFrame:

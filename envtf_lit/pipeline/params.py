@@ -5,10 +5,9 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from envtf_lit.agents.options import NO_WORLD_MODEL, CommonOptions, PolicyOptions
-from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.data.options import DownloadOptions, check_download
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.imagination.options import GenerateRolloutsOptions, RolloutOptions
@@ -17,8 +16,18 @@ from envtf_lit.options.schema import Precision, build, build_tagged
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.world_models.options import KINDS, EnsembleOptions, TransformerOptions, WorldModelOptions
 
+if TYPE_CHECKING:
+    from envtf_lit.agents.agent import Agent
+
 NAME = re.compile(r"[A-Za-z0-9][\w-]*")  # of world models and policies: they name folders
 COMMON = tuple(f.name for f in dataclasses.fields(CommonOptions))
+
+
+def algorithms() -> dict[str, type["Agent"]]:
+    """The registry, imported when it is asked for: torch comes with it, which most stages' `--help` does without."""
+    from envtf_lit.agents.registry import ALGORITHMS
+
+    return ALGORITHMS
 
 
 @dataclass(frozen=True)
@@ -44,7 +53,7 @@ def _default_models() -> dict[str, WorldModelOptions]:
 
 def _default_policies() -> dict[str, PolicyOptions]:
     chosen = {"bc": {"return_temperature": None}, "cql": {}, "et_cql": {"world_model": "transformer"}}
-    return {name: ALGORITHMS[name].Options(**options) for name, options in chosen.items()}
+    return {name: algorithms()[name].Options(**options) for name, options in chosen.items()}
 
 
 @dataclass(frozen=True)
@@ -126,7 +135,7 @@ def _named(stage: str, sections: Mapping[str, Any]) -> Iterator[tuple[str, str, 
 
 def _policies(common: CommonOptions, sections: Mapping[str, Any]) -> Iterator[tuple[str, PolicyOptions]]:
     """Each policy's own options over what all share."""
-    classes = {name: algorithm.Options for name, algorithm in ALGORITHMS.items()}
+    classes = {name: algorithm.Options for name, algorithm in algorithms().items()}
     shared = dataclasses.asdict(common)
     for name, key, values in _named("train_policy", sections):
         whole = {**shared, **values} if isinstance(values, Mapping) else values
@@ -139,7 +148,7 @@ def algorithm_of(options: PolicyOptions) -> str:
     Raises:
         UserError: several have them.
     """
-    found = [name for name, algorithm in ALGORITHMS.items() if algorithm.Options is type(options)]
+    found = [name for name, algorithm in algorithms().items() if algorithm.Options is type(options)]
     if len(found) > 1:  # one would be trained in place of the other
         raise UserError(f"{' and '.join(found)} have {type(options).__name__} in common: give each options of its own.")
     return found[0]
@@ -192,7 +201,7 @@ def check_rules(params: Params) -> None:
 def _check_policy(section: str, options: PolicyOptions, params: Params) -> None:
     algorithm = algorithm_of(options)
     model = options.world_model
-    if not ALGORITHMS[algorithm].imagines:
+    if not algorithms()[algorithm].imagines:
         if model != NO_WORLD_MODEL:
             raise UserError(
                 f"{section}.world_model is {model}, and {algorithm} learns from data alone: set it to none."

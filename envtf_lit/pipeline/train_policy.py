@@ -1,8 +1,10 @@
 """The stage `train_policy`: trains a policy on data alone, or on data and imagination."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from lightning.pytorch.callbacks import Callback
 from rich.console import Console
 
 from envtf_lit.agents.combo import MixingOptions
@@ -10,7 +12,7 @@ from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.agents.store import publish_policy
 from envtf_lit.data.datamodules import TransitionData
-from envtf_lit.data.loaders import UPDATES_PER_STEP
+from envtf_lit.data.options import UPDATES_PER_STEP
 from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.dataset import dataset_of
@@ -32,7 +34,12 @@ from envtf_lit.world_models.termination_head import termination_rule
 
 
 def train_policy(
-    params: Params, root: Path = Path("."), *, name: str | None = None, progress: bool = True
+    params: Params,
+    root: Path = Path("."),
+    *,
+    name: str | None = None,
+    callbacks: Sequence[Callback] = (),
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Trains a policy: `models/policy/NAME/`.
 
@@ -40,6 +47,7 @@ def train_policy(
         params: all options.
         root: of the project.
         name: of the section below `train_policy`; None where there is one alone.
+        callbacks: of `trained`.
         progress: shows a bar.
 
     Returns:
@@ -79,6 +87,7 @@ def train_policy(
             precision=params.precision,
             progress=progress,
             validate=False,
+            callbacks=callbacks,
         ) as curves:
             return publish_policy(target, agent.average_actor, curves, curves.rows[-1], settings, agent.records())
 

@@ -15,11 +15,10 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
-from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import check_plain
 from envtf_lit.options.schema import kind, options_class
-from envtf_lit.pipeline.params import COMMON, Params, algorithm_of, build_params, kind_of
+from envtf_lit.pipeline.params import COMMON, Params, algorithm_of, algorithms, build_params, kind_of
 from envtf_lit.pipeline.renamed_options import refuse_former
 from envtf_lit.world_models.options import KINDS
 
@@ -113,8 +112,8 @@ class Option:
 
 def describe(section: str) -> list[Option]:
     """The options of a part of `params.yaml`, such as `seed` or `train_policy.cql`, with defaults and meanings."""
-    cls, values = Params, dump_params(Params())
     names = section.split(".")
+    cls, values = Params, dump_params(Params() if names[0] == "train_policy" else Params(train_policy={}))
     for depth, name in enumerate(names[:-1]):
         cls, values = _section(cls, name, values[name], names[depth - 1] if depth else ""), values[name]
     parent = names[-2] if len(names) > 1 else ""
@@ -139,7 +138,7 @@ def _section(cls: Any, name: str, value: Any, parent: str) -> Any:
     """The dataclass behind a name, or None where it is a plain value; below a stage with named sections by its tag."""
     if parent in NAMED:
         tag = value[NAMED[parent]]
-        return KINDS[tag] if parent == "train_model" else ALGORITHMS[tag].Options
+        return KINDS[tag] if parent == "train_model" else algorithms()[tag].Options
     if cls is Params and name in NAMED:
         return Params
     return options_class(get_type_hints(cls)[name])
@@ -227,7 +226,7 @@ def _yaml_lines(cls: Any, values: Mapping[str, Any], depth: int, explained: set[
 
 def _named_lines(stage: str, name: str, values: Mapping[str, Any], explained: set[str]) -> Iterator[str]:
     """A named section: its tag with the choices, then its options."""
-    tag, choices = NAMED[stage], KINDS if stage == "train_model" else ALGORITHMS
+    tag, choices = NAMED[stage], KINDS if stage == "train_model" else algorithms()
     yield f"  {name}:"
     line, meaning = f"    {tag}: {values[tag]}", " | ".join(choices)
     yield line if meaning in explained else f"{line}  # {meaning}"

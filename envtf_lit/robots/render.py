@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 VIEW = 2.6  # metres across the drawn picture
+RIM, GHOST = (60, 60, 60), (122, 172, 214)  # colours of limbs' edges, and of a ghost as a whole
 SHARPNESS = 3  # drawn larger by this factor, then shrunk, for smooth edges
 
 
@@ -49,7 +50,19 @@ def draw(model: mujoco.MjModel, positions: np.ndarray, size: int) -> np.ndarray:
     return np.stack(frames)
 
 
-def _side_view(model: mujoco.MjModel, data: mujoco.MjData, size: int) -> np.ndarray:
+def draw_with_ghost(model: mujoco.MjModel, positions: np.ndarray, ghosts: np.ndarray, size: int) -> np.ndarray:
+    """As `draw`, each pose (F, Q) in front of another one (F, Q) in a single pale colour, which no camera follows."""
+    data, ghost = mujoco.MjData(model), mujoco.MjData(model)
+    frames = []
+    for pose, other in zip(positions, ghosts, strict=True):
+        data.qpos[:], ghost.qpos[:] = pose, other
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_kinematics(model, ghost)
+        frames.append(_side_view(model, data, size, ghost))
+    return np.stack(frames)
+
+
+def _side_view(model: mujoco.MjModel, data: mujoco.MjData, size: int, ghost: mujoco.MjData | None = None) -> np.ndarray:
     scale = SHARPNESS * size / VIEW
     image = Image.new("RGB", (SHARPNESS * size, SHARPNESS * size), (236, 240, 245))
     pen = ImageDraw.Draw(image)
@@ -58,22 +71,27 @@ def _side_view(model: mujoco.MjModel, data: mujoco.MjData, size: int) -> np.ndar
     def pixel(point: np.ndarray) -> tuple[float, float]:
         return (point[0] - left) * scale, ground - point[2] * scale
 
+    def robot(data: mujoco.MjData, only: tuple[int, ...] | None = None) -> None:
+        for i in np.argsort(-data.geom_xpos[:, 1], kind="stable"):  # what is farther away first
+            if model.geom_bodyid[i] != 0 and int(model.geom_type[i]) in rounded:
+                half = data.geom_xmat[i].reshape(3, 3)[:, 2] * model.geom_size[i, 1]  # (3,) centre to cap
+                ends = pixel(data.geom_xpos[i] - half), pixel(data.geom_xpos[i] + half)
+                colour = only or tuple(int(255 * c) for c in model.geom_rgba[i, :3])
+                _capsule(pen, *ends, model.geom_size[i, 0] * scale, colour, rim=only or RIM)
+
     pen.rectangle((0, ground, image.width, image.height), fill=(205, 212, 220))
     for metre in range(int(np.floor(left)), int(np.ceil(left + VIEW)) + 1):  # marks that show the robot's progress
         mark = (metre - left) * scale
         pen.line((mark, ground, mark, image.height), fill=(160, 168, 178), width=SHARPNESS)
     rounded = {int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_SPHERE)}
-    for i in np.argsort(-data.geom_xpos[:, 1], kind="stable"):  # what is farther away first
-        if model.geom_bodyid[i] != 0 and int(model.geom_type[i]) in rounded:
-            half = data.geom_xmat[i].reshape(3, 3)[:, 2] * model.geom_size[i, 1]  # (3,) centre to cap
-            ends = pixel(data.geom_xpos[i] - half), pixel(data.geom_xpos[i] + half)
-            colour = tuple(int(255 * c) for c in model.geom_rgba[i, :3])
-            _capsule(pen, *ends, model.geom_size[i, 0] * scale, colour)
+    if ghost is not None:
+        robot(ghost, GHOST)
+    robot(data)
     return np.asarray(image.resize((size, size), Image.Resampling.BOX))
 
 
-def _capsule(pen: ImageDraw.ImageDraw, start: tuple, end: tuple, radius: float, colour: tuple) -> None:
-    for grow, fill in ((SHARPNESS, (60, 60, 60)), (0, colour)):  # a dark rim, then the body
+def _capsule(pen: ImageDraw.ImageDraw, start: tuple, end: tuple, radius: float, colour: tuple, *, rim: tuple) -> None:
+    for grow, fill in ((SHARPNESS, rim), (0, colour)):  # a rim, then the body
         pen.line((*start, *end), fill=fill, width=round(2 * (radius + grow)))
         for x, y in (start, end):
             r = radius + grow

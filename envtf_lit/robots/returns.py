@@ -27,7 +27,7 @@ class Episode:
         observations: (T + 1, S) float32, from the reset to the last state.
         actions: (T, A) float32.
         rewards: (T,) float64.
-        positions: (T + 1, Q) float64, the simulator's generalised coordinates `qpos`.
+        positions: (T + 1, Q) float64, MuJoCo's generalised coordinates `qpos`; Q is 0 in another simulator.
     """
 
     seed: int
@@ -44,7 +44,7 @@ class Returns:
     Attributes:
         returns: (E,) float64, undiscounted sums of rewards.
         lengths: (E,) int64, steps.
-        scores: (E,) float64, D4RL-normalised: 0 is a random policy, 100 D4RL's expert.
+        scores: (E,) float64, D4RL-normalised: 0 is a random policy, 100 D4RL's expert; NaN of a robot without these.
         median: the episode of median return (the lower of the two middle ones where E is even).
     """
 
@@ -98,7 +98,8 @@ class _Lane:
         self.rewards: list[float] = []
 
     def _qpos(self) -> np.ndarray:
-        return self.env.unwrapped.data.qpos.copy()  # pyright: ignore[reportAttributeAccessIssue]
+        data = getattr(self.env.unwrapped, "data", None)
+        return getattr(data, "qpos", np.empty(0)).copy()
 
     def step(self, action: np.ndarray) -> None:
         observation, reward, terminated, truncated, _ = self.env.step(action)

@@ -26,7 +26,7 @@ from envtf_lit.agents.phases import follow
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.dataset import OfflineDataset
-from envtf_lit.data.loaders import UPDATES_PER_STEP
+from envtf_lit.data.options import UPDATES_PER_STEP
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.files import write_json

@@ -1,10 +1,15 @@
-"""The machine of a measurement: its description, and timing on it."""
+"""The machine of a measurement: its description, timing and memory on it, and the code that ran."""
 
+import contextlib
 import os
 import platform
+import resource
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from importlib.metadata import version
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -86,3 +91,30 @@ def typical(rounds: list[dict[str, float]], name: str) -> float:
 def ratio(rounds: list[dict[str, float]], slow: str, fast: str) -> float:
     """How many times as long one action takes as another: the median of each round's own ratio."""
     return median(values[slow] / values[fast] for values in rounds)
+
+
+def peak_memory_mb() -> float:
+    """The most that this process has held in memory, MB (10^6 bytes).
+
+    Linux tells it of the program itself; what `getrusage` says holds what whoever started the process had, too.
+    """
+    with contextlib.suppress(OSError):
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmHWM:")[2].split()[0]) * 1024 / 1e6
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+def code_version() -> str:
+    """The commit that this package's code is of, with `-changed` behind it where files differ; else its version."""
+    folder = Path(__file__).parent.parent
+
+    def git(*words: str) -> str:
+        call = ["git", "-C", str(folder), *words]
+        return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", "__init__.py")  # not the repository that an environment happens to lie in
+        return git("rev-parse", "--short=10", "HEAD") + ("-changed" if git("status", "--porcelain", "--", ".") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return version("envtf-lit")

@@ -18,7 +18,7 @@ from envtf_lit.world_models.store import save_world_model
 from envtf_lit.world_models.termination_head import TERMINATION, learn_termination, save_termination
 
 REACH, TOLERATED = "open_loop_0.1_median", 0.1  # name of a model's reach, and the nmse up to which it reaches
-REACH_SEGMENTS, REACH_STEPS = 100, 100  # held-out stretches that it is taken from
+REACH_SEGMENTS, REACH_STEPS = 100, 100  # stretches of the episodes for validation that it is taken from
 
 
 def fit_world_model(
@@ -105,7 +105,9 @@ def publish_world_model(
 
 
 def reach(model: WorldModel, data: WindowData, *, seed: int) -> int:
-    """Steps before a model's open loop passes an nmse of 0.1: the median over held-out stretches, at most 100.
+    """Steps before a model's open loop passes an nmse of 0.1: the median over validation stretches, at most 100.
+
+    It chooses how far policies imagine, so the episodes for testing have no part in it.
 
     Args:
         model: with parameters, in eval mode.
@@ -113,7 +115,7 @@ def reach(model: WorldModel, data: WindowData, *, seed: int) -> int:
         seed: of the stretches' beginnings.
     """
     device = next(cast(nn.Module, model).parameters()).device
-    stretches = segments(data.held_out, REACH_SEGMENTS, REACH_STEPS, seed=seed).to(device)
+    stretches = segments(data.validation, REACH_SEGMENTS, REACH_STEPS, seed=seed).to(device)
     error = nmse(forecast(model, stretches, feedback="imagined").mean, stretches, Scale.of(data.train, device))
     return median_steps_within(error, stretches.lengths, TOLERATED)
 
