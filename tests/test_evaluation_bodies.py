@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from envtf_lit.errors import UserError
-from envtf_lit.evaluation.bodies import changed_bodies, same_actions
+from envtf_lit.evaluation.bodies import changed_bodies, same_actions, travelled
 from envtf_lit.robots.hidden_dynamics import Factors
 from envtf_lit.robots.tasks import get_task
 
@@ -32,6 +32,19 @@ def test_the_same_actions_begin_alike_and_lead_elsewhere():
     assert np.array_equal(found["nominal"], found["again"])
     assert np.array_equal(found["weak"][0], found["nominal"][0])
     assert np.abs(found["weak"][1:] - found["nominal"][1:]).max(1).min() > 1e-3
+
+
+def test_the_way_is_the_sum_of_the_speeds():
+    (path,) = same_actions(CHEETAH, {"nominal": Factors()}, ACTIONS, seed=3).values()
+    env = CHEETAH.make()
+    env.reset(seed=3)
+    env.apply(Factors())  # pyright: ignore[reportAttributeAccessIssue]
+    places = [env.unwrapped.data.qpos[0]]  # pyright: ignore[reportAttributeAccessIssue]
+    for action in ACTIONS:
+        env.step(action)
+        places.append(env.unwrapped.data.qpos[0])  # pyright: ignore[reportAttributeAccessIssue]
+    way = travelled(CHEETAH, path)
+    assert way[0] == 0 and way[-1] == pytest.approx(places[-1] - places[0], abs=0.03)
 
 
 def test_a_body_changes_when_it_should_and_not_before():

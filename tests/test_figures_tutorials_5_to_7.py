@@ -32,12 +32,12 @@ def table(path: Path) -> pd.DataFrame:
 
 
 def test_bodies_and_their_change(tmp_path: Path) -> None:
-    found = {"nominal": np.zeros((6, 3)), "weak": np.ones((4, 3))}
-    apart = bodies_apart(found, "speed (m/s)", 1, tmp_path / "bodies.png")
+    apart = bodies_apart({"nominal": np.zeros(6), "weak": np.ones(4)}, "way (m)", tmp_path / "bodies.png")
     assert table(apart).groupby("body")["value"].agg(["size", "mean"]).to_numpy().tolist() == [[6, 0], [4, 1]]
     curves = {name: np.exp(np.random.default_rng(0).normal(size=(3, 9))) for name in ("transformer", "ensemble")}
-    change = change_curves(curves, 4, tmp_path / "change.png")
+    change = change_curves(curves, 4, tmp_path / "change.png", begun={"transformer": np.ones((3, 5))})
     assert table(change).query("model == 'ensemble'")["median"].tolist() == pytest.approx(curves["ensemble"][1], 1e-5)
+    assert table(change).query("begun == 4")["step"].tolist() == [4, 5, 6, 7, 8]
     assert {rgb("#D55E00"), rgb("#0072B2")} <= colours(change)
 
 

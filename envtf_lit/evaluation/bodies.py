@@ -8,6 +8,7 @@ import torch
 from envtf_lit.errors import UserError
 from envtf_lit.policy import Policy
 from envtf_lit.robots.hidden_dynamics import Factors, HiddenDynamics
+from envtf_lit.robots.silhouette import Silhouette
 from envtf_lit.robots.tasks import ROBOTS, Robot
 from envtf_lit.world_models.forecast import Trajectories
 
@@ -41,6 +42,13 @@ def same_actions(
         found[name] = np.array(seen, np.float32)
     env.close()
     return found
+
+
+def travelled(robot: Robot, observations: np.ndarray) -> np.ndarray:
+    """(T + 1,) metres along the ground since the first of observations (T + 1, S), by the speed that they tell."""
+    silhouette = Silhouette(robot)
+    along = silhouette.time * observations[:, silhouette.seen].astype(np.float64)
+    return np.cumsum(along) - along[0]
 
 
 def changed_bodies(
