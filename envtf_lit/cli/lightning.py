@@ -18,6 +18,7 @@ from envtf_lit.cli.publish import KeepConfig, Publish
 from envtf_lit.cli.saved_options import (
     checkpoint_class,
     checkpoint_options,
+    learned_online,
     model_architecture,
     model_kind,
     policy_architecture,
@@ -267,11 +268,13 @@ def _source(arguments: list[str]) -> type[TransitionData]:
     """The data module of `--data.source`, on which the other options of the data depend.
 
     Raises:
-        UserError: it is unknown.
+        UserError: it is unknown, or a run that learned online shall go on without.
     """
-    source = given("data.source", arguments) or "file"
+    source, checkpoint = given("data.source", arguments) or "file", given("ckpt_path", arguments)
     if source not in SOURCES:
         raise UserError(f"--data.source is {source!r}: {did_you_mean(source, SOURCES)}")
+    if source != "online" and checkpoint is not None and learned_online(checkpoint):
+        raise UserError(f"{checkpoint} is of a run that learns online: add --data.source online, and its data's flags.")
     return SOURCES[source]
 
 

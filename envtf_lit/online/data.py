@@ -32,7 +32,8 @@ class OnlineData(TransitionData):
     Before each batch the agent's actor acts, with noise, and what it lives through enters a replay buffer on the
     device. A share of each batch is of the log: half, as in RLPD (Ball et al. 2023, section 4.1, symmetric sampling).
     Nobody acts while an agent warms up on the log. What is drawn depends on seed and epoch alone, and a checkpoint
-    holds the buffer and where the environments stand, so that a run goes on to the same bits.
+    holds the buffer and where the environments stand, so that a run goes on to the same bits. A run on a log alone
+    can go on here, too, with its critics.
 
     Attributes:
         robot: in whose environment it acts.
@@ -80,6 +81,7 @@ class OnlineData(TransitionData):
         self.updates_per_env_step, self.log_share = updates_per_env_step, log_share
         self.first_steps, self.replay_rows, self.evaluation_episodes = first_steps, replay_rows, evaluation_episodes
         self.interaction = Interaction(self.robot, environments, seed)
+        self.began: int | None = None  # the agent's updates before the first one on experience, once that has come
         self.first_rows = [] if self.log is not None else self._random_steps(seed)
         super().__init__(path or "", seed=seed, **options)
         self.action_low, self.action_high = (limit.tolist() for limit in self.limits)
@@ -141,16 +143,17 @@ class OnlineData(TransitionData):
 
     def state_dict(self) -> dict[str, Any]:
         """Part of checkpoints."""
-        return dict(interaction=self.interaction.state_dict(), replay=self.replay.state_dict())
+        return dict(began=self.began, interaction=self.interaction.state_dict(), replay=self.replay.state_dict())
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As of a checkpoint; called by Lightning after `setup`."""
+        self.began = state_dict["began"]
         self.interaction.load_state_dict(state_dict["interaction"])
         self.replay.load_state_dict(state_dict["replay"])
 
     def _batches(self) -> Iterator[Batch]:
         """Those of the epoch under way."""
-        epoch, warm = cast(Any, self.trainer).current_epoch, self.warm_updates
+        epoch = cast(Any, self.trainer).current_epoch
         acting, drawing = (epoch_generator(self.seed, epoch, what, self.replay.device) for what in ("acting", "replay"))
         act = exploring(self.agent.actor, acting)
         drawn = DrawSampler(
@@ -163,10 +166,11 @@ class OnlineData(TransitionData):
         drawn.set_epoch(epoch)
         updates = UPDATES_PER_STEP * self.steps_per_epoch * epoch
         for rows in drawn:
-            if updates < warm:
+            if updates < self.warm_updates:
                 yield self.transitions[rows]
             else:
-                due = self.first_steps + (updates + UPDATES_PER_STEP - warm) / self.updates_per_env_step
+                self.began = updates if self.began is None else self.began
+                due = self.first_steps + (updates + UPDATES_PER_STEP - self.began) / self.updates_per_env_step
                 while self.interaction.steps < due:
                     self.replay.add(self.interaction.step(act))
                 yield self._mixed(rows, drawing)

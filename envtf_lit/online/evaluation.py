@@ -2,6 +2,7 @@
 
 import copy
 import math
+from dataclasses import replace
 from typing import cast
 
 import lightning as L
@@ -30,8 +31,8 @@ class Evaluation(Callback):
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         agent, data = cast(Agent, pl_module), _data_of(trainer)
-        allowed = data.replay.largest_reward / (1.0 - agent.options.discount)
-        agent.largest_return = max(agent.largest_return, allowed)
+        known, met = agent.log_returns, data.replay.largest_reward / (1.0 - agent.options.discount)
+        agent.log_returns = replace(known, largest=max(known.largest, met))
         logs = self._reached(trainer, agent) | {"train/env_steps": float(data.interaction.steps)}
         if finished := data.interaction.finished:
             logs["train/episode_return"] = sum(finished) / len(finished)
