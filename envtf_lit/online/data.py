@@ -12,7 +12,8 @@ from envtf_lit.agents.actor_critic import ActorCritic
 from envtf_lit.agents.warm_start import WarmStart
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.dataset import OfflineDataset, starts_from_ends
-from envtf_lit.data.loaders import UPDATES_PER_STEP, DrawSampler, epoch_generator
+from envtf_lit.data.loaders import DrawSampler, epoch_generator
+from envtf_lit.data.options import UPDATES_PER_STEP
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.online.interaction import Interaction, Rows
