@@ -65,9 +65,12 @@ def test_the_iqm_of_known_scores_is_known() -> None:
     found = standings(view, [], [])
     ordered = sorted(run.score_final for run in view.runs if run.algorithm == "et_cql")
     assert found["et_cql"].iqm == Estimate(
-        pytest.approx(sum(ordered[3:9]) / 6), pytest.approx(59.8, abs=1.0), pytest.approx(60.2, abs=1.0), 12
+        pytest.approx(sum(ordered[3:9]) / 6),
+        pytest.approx(59.8, abs=1.0),
+        pytest.approx(60.2, abs=1.0),
+        12,  # pyright: ignore[reportArgumentType]
     )
-    assert found["et_cql"].iqm.value == 60.0  # (39 + 40 + 41 + 79 + 80 + 81) / 6
+    assert found["et_cql"].iqm.value == 60.0  # (39 + 40 + 41 + 79 + 80 + 81) / 6  # pyright: ignore[reportOptionalMemberAccess]
     assert found["et_cql"].iqm_last10 is not None and found["et_cql"].iqm_last10.value == pytest.approx(58.0)
     assert (found["et_cql"].mean, found["et_cql"].best) == (55.0, 59.0)
     over = found["et_cql"].difference["cql"]
@@ -180,7 +183,7 @@ def test_figures_are_drawn_with_their_numbers_beside(results: Path, tmp_path: Pa
     assert list(curves["algorithm"].unique()) == ["Weighted BC", "CQL", "ET + CQL"]
     assert list(curves["robot"].unique()) == ["hopper", "walker2d", "ant"]
     found = pd.read_csv(tmp_path / "report/scores_same.csv")
-    assert list(found["algorithm"]) == ["ET + CQL", "CQL", "Weighted BC"] and found["value"][0] == 60.0
+    assert list(found["algorithm"]) == ["ET + CQL", "CQL", "Weighted BC"] and found["value"][0] == 60.0  # pyright: ignore[reportGeneralTypeIssues]
     for name in ("curves", "scores"):
         with Image.open(tmp_path / f"report/{name}_same.png") as image:
             assert min(image.size) > 200

@@ -55,7 +55,7 @@ def test_its_interval_is_that_of_a_bootstrap_within_tasks() -> None:
 
 def test_one_seed_a_task_gives_no_interval_and_a_mixture_gives_one() -> None:
     ones = [sample[:1] for sample in some_samples()]
-    assert interquartile_mean(ones) == Estimate(pytest.approx(trimmed(np.concatenate(ones))), None, None, 20)
+    assert interquartile_mean(ones) == Estimate(pytest.approx(trimmed(np.concatenate(ones))), None, None, 20)  # pyright: ignore[reportArgumentType]
     mixed = interquartile_mean([np.array([1.0]), np.array([2.0, 4.0]), np.array([3.0])])
     assert mixed.low is not None and mixed.low < mixed.value < (mixed.high or 0.0)
 
