@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -64,13 +65,13 @@ def test_the_iqm_of_known_scores_is_known() -> None:
     view = view_of(some_runs())
     found = standings(view, [], [])
     ordered = sorted(run.score_final for run in view.runs if run.algorithm == "et_cql")
-    assert found["et_cql"].iqm == Estimate(
+    close: list[Any] = [
         pytest.approx(sum(ordered[3:9]) / 6),
         pytest.approx(59.8, abs=1.0),
         pytest.approx(60.2, abs=1.0),
-        12,  # pyright: ignore[reportArgumentType]
-    )
-    assert found["et_cql"].iqm.value == 60.0  # (39 + 40 + 41 + 79 + 80 + 81) / 6  # pyright: ignore[reportOptionalMemberAccess]
+    ]
+    assert found["et_cql"].iqm == Estimate(middle, low, high, 12)
+    assert found["et_cql"].iqm.value == 60.0  # pyright: ignore[reportOptionalMemberAccess]
     assert found["et_cql"].iqm_last10 is not None and found["et_cql"].iqm_last10.value == pytest.approx(58.0)
     assert (found["et_cql"].mean, found["et_cql"].best) == (55.0, 59.0)
     over = found["et_cql"].difference["cql"]
