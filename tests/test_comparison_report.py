@@ -3,7 +3,7 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pandas as pd
 import pytest
@@ -65,11 +65,8 @@ def test_the_iqm_of_known_scores_is_known() -> None:
     view = view_of(some_runs())
     found = standings(view, [], [])
     ordered = sorted(run.score_final for run in view.runs if run.algorithm == "et_cql")
-    close: list[Any] = [
-        pytest.approx(sum(ordered[3:9]) / 6),
-        pytest.approx(59.8, abs=1.0),
-        pytest.approx(60.2, abs=1.0),
-    ]
+    middle: Any = pytest.approx(sum(ordered[3:9]) / 6)
+    low, high = (cast(Any, pytest.approx(bound, abs=1.0)) for bound in (59.8, 60.2))
     assert found["et_cql"].iqm == Estimate(middle, low, high, 12)
     assert found["et_cql"].iqm.value == 60.0  # pyright: ignore[reportOptionalMemberAccess]
     assert found["et_cql"].iqm_last10 is not None and found["et_cql"].iqm_last10.value == pytest.approx(58.0)
