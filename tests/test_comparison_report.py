@@ -214,7 +214,13 @@ def test_less_data_stands_beside_the_whole(tmp_path: Path) -> None:
     report(results, tmp_path / "report", budget="cpu-small")
     text = (tmp_path / "report/index.md").read_text()
     assert "| runs of each | 10 % | 50 % | 100 % |" in text
-    assert next(row for row in lines_of(text, "CQL") if len(row) == 5) == ["CQL", "1", "20.0", "40.0", "50.0"]
+    assert next(row for row in lines_of(text, "CQL") if len(row) == 5 and row[1] == "1") == [
+        "CQL",
+        "1",
+        "20.0",
+        "40.0",
+        "50.0",
+    ]
 
 
 def test_runs_that_diverged_and_several_versions_are_said(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.policy import load_policy
 from envtf_lit.robots.returns import evaluate_policy
 from envtf_lit.robots.tasks import ROBOTS
+from tests.chores import complain, end_itself, sleep_and_note, stumble
 
 TINY = budget_of("cpu-small", updates=30, episodes=1, transitions=2_000, model_updates=10)
 FLAGS = ["--updates", "30", "--episodes", "1", "--transitions", "2000", "--model-updates", "10"]
@@ -73,11 +74,12 @@ def test_a_run_is_trained_and_scored_as_its_row_says(work: Path) -> None:
     assert run.key == cell.key
     assert (run.updates, run.episodes, run.score_weighted_bc) == (30, 1, None)
     assert [point.updates for point in curve] == [10, 20, 30] and all(point.run == run.key for point in curve)
-    folder = Home(cell.task, TINY, work).path / "models/policy" / section_of(cell)
-    found = evaluate_policy(
-        load_policy(folder), ROBOTS["hopper"], episodes=1, seed=evaluation_seed(cell), progress=False
-    )
-    assert run.score_final == pytest.approx(found.scores.mean(), abs=1e-3)
+    policy = load_policy(Home(cell.task, TINY, work).path / "models/policy" / section_of(cell))
+    for shown, seed in ((run.score_final, 0), (curve[-1].score, cell_module.ALONG)):
+        played = evaluate_policy(
+            policy, ROBOTS["hopper"], episodes=1, seed=evaluation_seed(cell) + seed, progress=False
+        )
+        assert shown == pytest.approx(played.scores.mean(), abs=1e-3)
     scores = [point.score for point in curve]
     assert run.score_last10 == pytest.approx(sum(scores) / 3, abs=2e-3)
     assert run.score_best == max(*scores, run.score_final)
@@ -170,7 +172,7 @@ def test_a_grid_does_what_is_missing_alone(work: Path, tmp_path: Path, quick: No
     lines = before.decode().splitlines(keepends=True)
     results.write_text("".join(lines[:2]))  # the row of cql is lost
     run_grid(cells_of("wbc", "cql", "iql"), results, work=work, progress=False, report=said.append)
-    assert [line.split(",")[1] for line in said[4:]] == [" cql (same", " iql (same"]
+    assert [line.split(",")[1] for line in said[5:]] == [" cql (same", " iql (same"]
     assert len(read_records(results, Run)) == 3
     assert len(read_records(results.with_name(CURVES), Evaluation)) == 9
 
@@ -212,26 +214,6 @@ def test_nothing_is_begun_over_a_damaged_file_or_with_settings_that_contradict(w
 
 
 # processes
-
-
-def sleep_and_note(folder: Path, name: str, seconds: float) -> int:
-    begin = time.time()
-    time.sleep(seconds)
-    (folder / name).write_text(f"{begin} {time.time()}")
-    return os.getpid()
-
-
-def end_itself(folder: Path) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def complain(folder: Path) -> None:
-    print("on the way")
-    raise UserError("This was asked for.")
-
-
-def stumble(folder: Path) -> None:
-    raise ZeroDivisionError("by nought")
 
 
 def job(folder: Path, name: str, function: Any = sleep_and_note, *given: Any, after: tuple[str, ...] = ()) -> Job:

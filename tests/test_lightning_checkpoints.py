@@ -60,7 +60,8 @@ def test_a_continued_run_keeps_the_checkpoints_options_where_no_flag_differs(kin
 
 def written() -> dict[str, bytes]:
     """Name and bytes of every file that fit published."""
-    return {path.name: path.read_bytes() for path in sorted(Path(".envtf/published").iterdir())}
+    files = (path for path in sorted(Path(".envtf/published").rglob("*")) if path.is_file())
+    return {str(path): path.read_bytes() for path in files}
 
 
 @pytest.mark.parametrize("kind", ["model", "agent"])

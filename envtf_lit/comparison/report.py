@@ -98,6 +98,7 @@ def _kit(view: View, found: Mapping[str, Standing], known: Mapping[str, Log], ru
     """The parts on one kit."""
     meaning = KITS[view.kit].meaning
     lacked = missing(view, read_budget(view.budget))
+    evaluated = any(standing.reached is not None for standing in found.values())  # along the way: there are curves
     return [
         f"## {TITLES[view.kit]}",
         f"{meaning[0].upper()}{meaning[1:]}. {page.weighted_bc_note(view)}",
@@ -107,7 +108,7 @@ def _kit(view: View, found: Mapping[str, Standing], known: Mapping[str, Log], ru
         page.pairs(found),
         "**No harm.** " + page.no_harm(*harm(view, known)),
         *page.diverged(early(view)),
-        f"![Learning curves, a panel per task](curves_{view.kit}.png)",
+        *([f"![Learning curves, a panel per task](curves_{view.kit}.png)"] if evaluated else []),
         "Median share of the updates after which an evaluation first had 90 % of the final score; median seconds of "
         "training, without evaluations and world model; the most memory of a run's process:",
         page.costs(found),
