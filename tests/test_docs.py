@@ -56,6 +56,12 @@ def test_the_index_names_every_page_beside_it() -> None:
     assert beside - listed == {DOCS / "README.md", SITE_FRONT}
 
 
+def test_pages_link_to_no_front_page() -> None:
+    """The folder's README is part of the site's front page, and none of the site's own."""
+    fronts = (DOCS / "README.md", SITE_FRONT)
+    assert [page.name for page in PAGES[2:] for path, _ in links(page) if path in fronts] == []
+
+
 def test_addresses_elsewhere_are_whole() -> None:
     found = [link for page in PAGES for link in LINK.findall(page.read_text()) if "://" in link]
     assert found
