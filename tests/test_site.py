@@ -4,6 +4,10 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -27,6 +31,22 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "html"
 
 
+class Quiet(SimpleHTTPRequestHandler):
+    """Serves files and says nothing."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def address(site: Path) -> Iterator[str]:
+    """Where the site is served; the search fetches pages, which browsers allow no file to do."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
 def shown(page: str, width: int = 1280) -> tuple[str, str]:
     """What a page has become after its scripts ran, and what the browser's console says of it."""
     flags = ["--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900", "--virtual-time-budget=20000"]
@@ -46,15 +66,15 @@ def test_no_page_fetches_anything(site: Path) -> None:
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
 @pytest.mark.parametrize("name", PAGES)
-def test_pages_show_their_formulas_and_the_console_stays_silent(site: Path, name: str) -> None:
-    page, console = shown(f"file://{site}/{name}.html")
+def test_pages_show_their_formulas_and_the_console_stays_silent(address: str, name: str) -> None:
+    page, console = shown(f"{address}/{name}.html")
     assert console == ""
     assert "<mjx-merror" not in page
     assert ("<mjx-container" in page) == (name == "algorithms/mopo")
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
-def test_the_search_finds_mopo(site: Path) -> None:
-    page, console = shown(f"file://{site}/search.html?q=MOPO")
+def test_the_search_finds_mopo(address: str) -> None:
+    page, console = shown(f"{address}/search.html?q=MOPO")
     assert console == ""
     assert 'href="algorithms/mopo.html' in page
