@@ -5,6 +5,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MKL_NUM_THREADS", "1")
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,14 @@ from envtf_lit.pipeline.yaml import params_yaml, preset_params
 from envtf_lit.world_models.options import EnsembleOptions, WorldModelOptions
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def short_promises() -> Iterator[None]:
+    """What a world model promises of a policy is asked of imagined episodes of at most 30 steps, not of 1,000."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("envtf_lit.imagination.promise.LONGEST", 30)
+        yield
 
 
 @pytest.fixture(scope="session")
