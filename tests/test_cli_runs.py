@@ -18,6 +18,7 @@ import pytest
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.pipeline.yaml import dump_params, load_params, params_yaml, preset_params
 from tests.full_disk import full_disk
+from tests.lightning_runs import NO_LOGGER, QUIET
 from tests.test_cli import LIGHTNING, exit_status
 from tests.walker import walker_dataset
 
@@ -245,7 +246,7 @@ def test_a_disk_that_is_full_of_checkpoints_is_said_in_a_sentence(
     monkeypatch.chdir(tmp_path)
     sizes = {"layers": 1, "width": 16, "context": 4, "updates_per_epoch": 2, "updates": 2}
     options = [f"--model.options.{key}={value}" for key, value in sizes.items()]
-    fit = ["model", "fit", "--data.path", str(tiny_download / "data/dataset.h5"), "--trainer.logger=false", *options]
+    fit = ["model", "fit", "--data.path", str(tiny_download / "data/dataset.h5"), NO_LOGGER, *QUIET, *options]
     import_module("envtf_lit.cli.lightning")  # Python's own files of bytecode are larger, too
     with full_disk(4_000):
         assert exit_status(fit) == 2
