@@ -63,6 +63,7 @@ def _outcome(reference: "ObjectRef") -> Outcome:
 @contextmanager
 def _cluster(address: str, workers: int) -> Iterator[None]:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # or it reports to its makers
+    os.environ.setdefault("RAY_agent_register_timeout_ms", "120000")  # a busy machine needs more than its 15 s to start
     try:
         import ray
     except ImportError as error:
@@ -71,6 +72,7 @@ def _cluster(address: str, workers: int) -> Iterator[None]:
     try:
         ray.init(address=address, log_to_driver=False, configure_logging=False, **given)
     except Exception as error:  # Ray raises that itself where a node is slow to start
+        ray.shutdown()
         reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
         cure = "try again on a machine that is less busy" if address == LOCAL else "start one with `ray start --head`"
         raise UserError(f"There is no Ray cluster at {address!r} ({reason}): {cure}.") from None
