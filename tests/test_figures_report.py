@@ -207,7 +207,7 @@ def test_the_report_without_a_simulator(offline: Run):
     assert "No video" in text and "a classifier learned from the log says so" in text
     assert "D4RL" not in text and "score" not in text
     first, rest = text.split("transitions in", 1)  # before a word is said of the data
-    assert "**Try first ET + CQL**" in first and "**ET + CQL acts beyond the log**" in first
+    assert "**Try first ET + CQL**" in first and "ET + CQL **acts beyond the log**" in first
     assert "promised **390 to 450**" in rest
     assert page.read_text().count('src="data:image/png') == 10
 

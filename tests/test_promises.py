@@ -147,13 +147,18 @@ def test_where_there_is_a_simulator_it_says_whether_the_promise_held(tmp_path: P
 
 def test_policies_beyond_the_log_are_called_so_for_distance_and_for_straying(offline: Run) -> None:
     text = promises.first_to_try(changed(offline))
-    assert "0.20 nats per dimension less likely" in text and "in 3.0% of its imagined steps" in text
+    assert "ET + CQL **acts beyond the log**: held-out actions are 0.20 nats per dimension less likely" in text
+    assert "; in 3.0% of its imagined steps" in text
     near = promises.first_to_try(changed(offline, some_frontier(1)))
-    assert "beyond the log" not in near
+    assert "beyond the log" not in near and "way from the log" not in near
     strays = some_frontier(1)
     strays[1]["lost"] = 0.02
     text = promises.first_to_try(changed(offline, strays))
-    assert "**ET + CQL acts beyond the log**: in 2.0% of its imagined steps" in text and "less likely" not in text
+    assert "ET + CQL **acts beyond the log**: in 2.0% of its imagined steps" in text and "less likely" not in text
+    for excess, words in ((0.2, "is some way from the log"), (0.31, "**acts beyond the log**")):
+        far = some_frontier(1)
+        far[1]["excess"] = excess
+        assert f"ET + CQL {words}: held-out actions are {excess:.2f}" in promises.first_to_try(changed(offline, far))
 
 
 def test_it_says_what_to_try_first_and_what_before(offline: Run) -> None:
@@ -175,7 +180,7 @@ def test_of_several_levels_the_nearest_to_the_log_that_surely_gains_is_first(off
     vars(run)["trust"] = {"dreamer": "default", "near": "cautious"}.get
     run.card["returns"] = {"mean": 320.0}
     assert "**Try first Near** (`trust: cautious`)" in promises.first_to_try(run)
-    assert "ET + CQL acts beyond the log" in promises.first_to_try(run)
+    assert "ET + CQL **acts beyond the log**" in promises.first_to_try(run)
     run.card["returns"] = {"mean": 360.0}
     text = promises.first_to_try(run)
     assert "**Try first ET + CQL**" in text and "Before it" not in text  # the cautious one is there

@@ -7,6 +7,7 @@ from envtf_lit.evaluation.promises import Range, kept, promised_range
 from envtf_lit.figures.report import Run
 
 NEAR = LEVELS["cautious"].slack  # nats from the clone within which a policy is near the log
+FAR = LEVELS["default"].slack  # beyond which it is called so, as where the model has left what it knows
 STRAYED = 0.005  # of imagined steps: how much more often than the clone's a policy's may be lost without a word
 
 
@@ -72,21 +73,24 @@ def _why(run: Run, name: str) -> str:
 
 
 def _beyond(run: Run, name: str) -> str:
-    """A warning where a policy acts beyond the log; else nothing."""
+    """How far a policy is from the log, if further than `cautious` goes; a warning where it acts beyond the log."""
     table = run.frontiers[name]
     clone, row = table[0], kept(table)
-    reasons = []
-    if row["excess"] > NEAR:
-        reasons.append(
-            f"held-out actions are {row['excess']:.2f} nats per dimension less likely under it than under the clone "
-            f"(`cautious` allows {NEAR:g})"
-        )
-    if row["lost"] > clone["lost"] + STRAYED:
-        reasons.append(
-            f"in {row['lost']:.1%} of its imagined steps the model has left what it knows, or promises more than was "
-            f"ever paid (of the clone's: {clone['lost']:.1%})"
-        )
-    return f"**{run.label(name)} acts beyond the log**: {'; '.join(reasons)}." if reasons else ""
+    distance = (
+        f"held-out actions are {row['excess']:.2f} nats per dimension less likely under it than under the clone, and "
+        f"`cautious` goes {NEAR:g} nats"
+    )
+    strayed = (
+        f"in {row['lost']:.1%} of its imagined steps the model has left what it knows, or promises more than was ever "
+        f"paid (of the clone's: {clone['lost']:.1%})"
+    )
+    reasons = [distance] if row["excess"] > NEAR else []
+    reasons += [strayed] if row["lost"] > clone["lost"] + STRAYED else []
+    if not reasons:
+        return ""
+    warned = row["excess"] > FAR or strayed in reasons
+    place = "**acts beyond the log**" if warned else "is some way from the log"
+    return f"{run.label(name)} {place}: {'; '.join(reasons)}."
 
 
 def first_to_try(run: Run) -> str:
