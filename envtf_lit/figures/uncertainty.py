@@ -37,7 +37,7 @@ def beliefs_on_a_line(
                 axis.fill_between(one.x, low, high, color=PAIR[0], alpha=opacity, lw=0, label=label, zorder=2)
             axis.plot(one.x, truth, color="black", linestyle="--", linewidth=1.3, label="truth", zorder=3)
             axis.plot(one.x, one.mean, color=PAIR[0], linewidth=2, label="model's mean", zorder=4)
-            axis.set(title=name, xlabel="state x", ylim=(-3.2, 3.2))
+            axis.set(title=name, xlabel="state x", ylim=(-2.6, 2.6))
             axis.label_outer()
         axes[0, 0].set_ylabel("next state x′")
         handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -158,7 +158,7 @@ def promise_and_truth(table: pd.DataFrame, recorded: float, path: str | Path) ->
 
     Args:
         table: columns `speed`, `promised`, `true` (reward a step) and `halted` (share of rollouts).
-        recorded: speed that the log was held to, in m/s.
+        recorded: speed that the log's governor was set to, in m/s.
         path: PNG to write; the numbers go beside it as CSV.
     """
     with drawing(path, (10.0, 3.8), 1, 2) as (_, axes):
@@ -169,8 +169,8 @@ def promise_and_truth(table: pd.DataFrame, recorded: float, path: str | Path) ->
         right.plot(table["speed"], 100 * table["halted"], color=PAIR[1], marker="^")
         right.set(ylabel="rollouts halted as too new (%)", ylim=(-2, 102))
         for axis in axes.flat:
-            axis.axvline(recorded, color="gray", linestyle=":", label="the log's speed")
-            axis.set_xlabel("speed that the policy asks for (m/s)")
+            axis.axvline(recorded, color="gray", linestyle=":", label="the log's governor")
+            axis.set_xlabel("speed that the governor is set to (m/s)")
         left.legend(loc="lower left", fontsize="small")
     write_table(path, table)
     return Path(path)
