@@ -18,7 +18,7 @@ from envtf_lit.robots.returns import evaluate_policy
 from envtf_lit.robots.tasks import ROBOTS
 from envtf_lit.studies import narrow
 from envtf_lit.studies.narrow import NarrowOptions, page, run_narrow
-from envtf_lit.studies.narrow_logs import BEYOND, FIRST_SEED, MACHINES, RUIN, _driver, make_log, simulator
+from envtf_lit.studies.narrow_logs import BEYOND, FIRST_SEED, MACHINES, RUIN, driver, make_log, simulator
 
 STEP = 0.05  # seconds of HalfCheetah's
 
@@ -46,9 +46,9 @@ def test_the_governor_lets_actions_fade_to_a_fifth(speed: float, share: float):
     """Without the actions' limits, which come after it."""
     machine, seen = replace(MACHINES["governed"], gain=1.0), torch.zeros(1, 18)
     seen[0, 9] = speed
-    bare = _driver(replace(machine, governor=None), eager=False)(seen)
-    torch.testing.assert_close(_driver(machine, eager=False)(seen), share * bare)
-    assert _driver(machine, eager=True)(seen).abs().sum() >= _driver(machine, eager=False)(seen).abs().sum()
+    bare = driver(replace(machine, governor=None), eager=False)(seen)
+    torch.testing.assert_close(driver(machine, eager=False)(seen), share * bare)
+    assert driver(machine, eager=True)(seen).abs().sum() >= driver(machine, eager=False)(seen).abs().sum()
 
 
 def test_the_governor_holds_the_machine_back(governed):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import MaxNLocator
 
 from envtf_lit.figures.style import LINES, POLICY_COLOURS, drawing, write_table
 
@@ -55,6 +56,7 @@ def steps_back(weights: np.ndarray, path: str | Path) -> Path:
             axis.axhline(1 / context, color="gray", linestyle=":", linewidth=1.2, label="an even share")
             axis.set(title=f"layer {layer + 1}", xlabel="steps back")
             axis.set_ylim(0, 1.08 * max(weights.max(), 1 / context))
+            axis.xaxis.set_major_locator(MaxNLocator(6, integer=True))
             axis.label_outer()
         axes[0, 0].set_ylabel("mean weight")
         axes[0, -1].legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)

@@ -130,7 +130,7 @@ def make_log(machine: Machine, *, episodes: int = EPISODES, steps: int = 1_000) 
     rng, env = np.random.default_rng(0), simulator(machine).make()
     rows: list[tuple[Any, ...]] = []
     for episode in range(episodes):
-        rows += _episode(env, _driver(machine, eager=episode < EAGER), machine.noise, rng, FIRST_SEED + episode, steps)
+        rows += _episode(env, driver(machine, eager=episode < EAGER), machine.noise, rng, FIRST_SEED + episode, steps)
     env.close()
     observations, actions, rewards, following, speeds, terminated, ends = (
         np.array(column) for column in zip(*rows, strict=True)
@@ -150,8 +150,8 @@ def make_log(machine: Machine, *, episodes: int = EPISODES, steps: int = 1_000) 
     return log, float(BEYOND * speeds.max())
 
 
-def _driver(machine: Machine, *, eager: bool) -> Callable[[Tensor], Tensor]:
-    """What acts on (B, S) observations of the machine, before noise."""
+def driver(machine: Machine, *, eager: bool = False) -> Callable[[Tensor], Tensor]:
+    """What acts on (B, S) observations of the machine, before noise; `eager`: .3 m/s faster."""
     robot = ROBOTS[machine.robot]
     actor, first = _actor(robot, machine.snapshot), int(machine.odometer)
 
