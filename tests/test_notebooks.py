@@ -87,7 +87,8 @@ def test_it_runs_at_its_tiny_size_with_its_solutions(name: str, tmp_path: Path) 
     found = outputs(page.with_suffix(".ipynb"))
     assert [output for output in found if output.get("name") == "stderr"] == []
     said = " ".join(output["data"].get("text/markdown", "") for output in found if "data" in output)
-    assert len(said) > 500 and not re.search(r"\bnan\b|\binf\b|None", said)
+    told = re.sub(r"```.*?```", "", said, flags=re.DOTALL)  # sources that are shown may speak of infinity
+    assert len(told) > 500 and not re.search(r"\bnan\b|\binf\b|None", told)
     assert str(tmp_path) not in str(found)
     assert "<summary>code</summary>" not in page.read_text("utf-8")
 
