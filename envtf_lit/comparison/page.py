@@ -1,8 +1,10 @@
 """The comparison's page in Markdown, part by part."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from statistics import fmean
 
+from envtf_lit.comparison.claims import Claim
 from envtf_lit.comparison.findings import BASES, Harm, Log, Standing
 from envtf_lit.comparison.grid import WEIGHTED_BC, Cell
 from envtf_lit.comparison.records import Run
@@ -112,6 +114,17 @@ def pairs(found: Mapping[str, Standing]) -> str:
         if base in standing.difference
     ]
     return markdown_table(head, rows)
+
+
+def claims(found: Iterable[Claim]) -> str:
+    """What the paper says, what these runs say of it, the verdict and its reason; the counts before it."""
+    found = list(found)
+    count = Counter(claim.verdict for claim in found)
+    line = (
+        f"Of {len(found)} claims {count['reproduces']} reproduce, {count['does not']} do not, {count['open']} are open."
+    )
+    rows = [[claim.said, claim.found, f"**{claim.verdict}**", claim.why] for claim in found]
+    return f"{line}\n\n{markdown_table(['the paper', 'these runs', 'verdict', 'why'], rows)}"
 
 
 def costs(found: Mapping[str, Standing]) -> str:

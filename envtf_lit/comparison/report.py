@@ -8,6 +8,7 @@ import pandas as pd
 
 from envtf_lit.comparison import page
 from envtf_lit.comparison.budgets import read_budget
+from envtf_lit.comparison.claims import claims
 from envtf_lit.comparison.findings import Log, Standing, early, harm, logs, missing, standings
 from envtf_lit.comparison.grid import KITS
 from envtf_lit.comparison.records import CURVES, SHARED, Evaluation, Run, Shared, read_records
@@ -43,7 +44,7 @@ def report(results: Path, out: Path = OUT, *, budget: str | None = None) -> dict
     runs = read_records(results, Run)
     if not runs:
         raise UserError(f"{results} has no runs: make some with `envtf compare run`.")
-    budget = _chosen(runs, budget)
+    budget = chosen_budget(runs, budget)
     curves, shared = (
         read_records(results.with_name(CURVES), Evaluation),
         read_records(results.with_name(SHARED), Shared),
@@ -65,7 +66,7 @@ def report(results: Path, out: Path = OUT, *, budget: str | None = None) -> dict
     return content
 
 
-def _chosen(runs: Sequence[Run], budget: str | None) -> str:
+def chosen_budget(runs: Sequence[Run], budget: str | None) -> str:
     """The budget to be reported.
 
     Raises:
@@ -106,6 +107,7 @@ def _kit(view: View, found: Mapping[str, Standing], known: Mapping[str, Log], ru
         "Run by run against CQL and weighted BC, with the same data, training seed and evaluation episodes; the "
         "interval over seeds is of these tasks, the one over tasks of others like them, too (Student's):",
         page.pairs(found),
+        "**What the paper claims.** " + page.claims(claims(view, found)),
         "**No harm.** " + page.no_harm(*harm(view, known)),
         *page.diverged(early(view)),
         *([f"![Learning curves, a panel per task](curves_{view.kit}.png)"] if evaluated else []),
@@ -144,8 +146,8 @@ def _data_shares(view: View, runs: Sequence[Run]) -> list[str]:
 BESIDE = {"published": ("et_cql_paper", "mopo", "rambo", "combo", "cql", "iql"), "same": ("et_cql",)}
 
 
-def _columns(view: View, names: Sequence[str]) -> list[Column]:
-    """Our own scores as the published ones are kept."""
+def own_columns(view: View, names: Sequence[str]) -> list[Column]:
+    """Our own scores as the published ones are kept, a column for each of these algorithms that has runs."""
     return [
         Column(
             label_of(name),
@@ -168,9 +170,9 @@ def _published(views: Iterable[View]) -> list[str]:
         f"ours are of other data and Gymnasium's -v5 ({OURS}): they stand beside each other, and differences between "
         "the two mean little. A column's mean is given over the sets of tasks that it has whole, since averages over "
         "different sets, as in the paper's last row, do not compare.",
-        page.paper_table([column for view in views for column in _columns(view, BESIDE[view.kit])]),
+        page.paper_table([column for view in views for column in own_columns(view, BESIDE[view.kit])]),
         "Everybody who has such a set whole:",
-        page.peers_table([column for view in views for column in _columns(view, view.algorithms)]),
+        page.peers_table([column for view in views for column in own_columns(view, view.algorithms)]),
         page.sweeps(),
     ]
 
@@ -180,7 +182,7 @@ def _draw(
 ) -> None:
     """The kit's figures; each is left out where there is nothing to show."""
     colours = policy_colours(label_of(name) for name in reversed(view.algorithms))  # the last, ours, has the first
-    table = _curves(view, curves)
+    table = curve_table(view, curves)
     if len(table):
         levels, title = (
             {task: (log.mean, log.best) for task, log in known.items()},
@@ -193,7 +195,7 @@ def _draw(
         score_intervals(points, out / f"scores_{view.kit}.png", colours=colours, title=title)
 
 
-def _curves(view: View, curves: Sequence[Evaluation]) -> pd.DataFrame:
+def curve_table(view: View, curves: Sequence[Evaluation]) -> pd.DataFrame:
     """The evaluations of the kit's runs, robots, tiers and algorithms in their usual order."""
     there = {run.run for run in view.runs}
     places = {name: place for names in (ROBOTS, TIERS, view.algorithms) for place, name in enumerate(names)}

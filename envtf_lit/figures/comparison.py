@@ -1,8 +1,9 @@
-"""Plots of the comparison: learning curves, a panel per task, and what the kit's algorithms score over all tasks."""
+"""Plots of the comparison: which runs there are, learning curves, scores over all tasks, and the paper's averages."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
@@ -44,7 +45,7 @@ def learning_curves(
             label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)
         }
         figure.legend(shown.values(), shown.keys(), loc="outside right upper", fontsize="small")
-        figure.suptitle(title)
+        figure.suptitle(title, x=0.02, ha="left")  # of one panel, the middle would be the legend's place
     write_table(path, curves)
     return Path(path)
 
@@ -87,4 +88,77 @@ def score_intervals(
         axis.set_ylim(-0.6, len(table) - 0.2)
         axis.set(xlabel="normalised score", title=title)
     write_table(path, table.iloc[::-1])
+    return Path(path)
+
+
+def averages_again(averages: pd.DataFrame, tasks: int, path: str | Path) -> Path:
+    """Averages as they are printed, each over its own tasks, and over the tasks that all have; the highest at the top.
+
+    Args:
+        averages: rows of `algorithm`, `printed`, `own` (tasks behind the printed one) and `equal`.
+        tasks: that all have.
+        path: PNG to write; the numbers go beside it as CSV.
+    """
+    table = averages.sort_values("equal").reset_index(drop=True)
+    with drawing(path, (7.6, 0.5 * len(table) + 1.3)) as (figure, axes):
+        axis = axes[0, 0]
+        axis.hlines(table.index, table["printed"], table["equal"], color=COLOURS["data"], linewidth=1.5, zorder=1)
+        axis.scatter(table["printed"], table.index, s=60, facecolors="white", edgecolors="black", label="as printed")
+        axis.scatter(table["equal"], table.index, s=60, color="black", label=f"over the same {tasks} tasks")
+        axis.set_yticks(
+            table.index, [f"{a} ({n} tasks)" for a, n in zip(table["algorithm"], table["own"], strict=True)]
+        )
+        axis.set_ylim(-0.6, len(table) - 0.4)
+        axis.set(xlabel="mean normalised score", title="One row of averages, twice")
+        figure.legend(loc="outside lower center", ncols=2, fontsize="small")
+    write_table(path, table.iloc[::-1])
+    return Path(path)
+
+
+def gains_by_task(gains: pd.DataFrame, path: str | Path, *, title: str) -> Path:
+    """How much higher one algorithm scores than another, a row per task and a marker for each source.
+
+    Args:
+        gains: rows of `task`, `source`, `gain`, and `low` and `high` where there are intervals.
+        path: PNG to write; the numbers go beside it as CSV.
+        title: over the plot.
+    """
+    tasks, sources = list(gains["task"].unique()), list(gains["source"].unique())
+    markers, colours = ("o", "D", "s"), ("#000000", "#D55E00", "#0072B2")
+    with drawing(path, (7.6, 0.3 * len(tasks) + 1.6)) as (figure, axes):
+        axis = axes[0, 0]
+        axis.axvline(0.0, color=COLOURS["threshold"], linewidth=1.2, zorder=1)
+        for place, (source, marker, colour) in enumerate(zip(sources, markers, colours, strict=False)):
+            here = gains[gains["source"] == source]
+            rows = [len(tasks) - 1 - tasks.index(task) + 0.18 * (len(sources) - 1 - 2 * place) for task in here["task"]]
+            if "low" in here:
+                axis.hlines(rows, here["low"], here["high"], color=colour, linewidth=2.5, alpha=0.4)
+            axis.scatter(here["gain"], rows, s=34, marker=marker, color=colour, label=source, zorder=3)
+        axis.set_yticks(range(len(tasks)), tasks[::-1])
+        axis.set_ylim(-0.6, len(tasks) - 0.4)
+        axis.set(xlabel="difference in normalised score", title=title)
+        figure.legend(loc="outside lower center", ncols=len(sources), fontsize="small")
+    write_table(path, gains)
+    return Path(path)
+
+
+def runs_there(counts: pd.DataFrame, path: str | Path, *, planned: int) -> Path:
+    """A map of how many seeds have a finished run, a row per task and a column per algorithm.
+
+    Args:
+        counts: (tasks, algorithms), named as the axes call them.
+        path: PNG to write; the numbers go beside it as CSV.
+        planned: seeds of each.
+    """
+    with drawing(path, (0.85 * counts.shape[1] + 2.4, 0.26 * len(counts) + 1.6)) as (_, axes):
+        axis = axes[0, 0]
+        axis.imshow(counts.to_numpy(), cmap="Greys", vmin=0, vmax=1.6 * planned, aspect="auto")
+        for row, column in np.ndindex(counts.shape):
+            number = counts.iat[row, column]
+            axis.text(column, row, f"{number}" if number else "·", ha="center", va="center", fontsize="small")
+        axis.set_xticks(range(counts.shape[1]), list(counts.columns), rotation=30, ha="right")
+        axis.set_yticks(range(len(counts)), list(counts.index))
+        axis.grid(visible=False)
+        axis.set_title(f"Seeds that are finished, of {planned}")
+    write_table(path, counts.rename_axis("task").reset_index())
     return Path(path)
