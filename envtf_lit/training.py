@@ -125,7 +125,7 @@ def trained(
     """Trains for `epochs`, resuming from `run` if a checkpoint lies there, and yields the curves to a block that
     publishes; until that has succeeded, `run` stays: after a kill there, nothing is left to train.
 
-    A checkpoint that cannot be read is set aside, and training starts anew.
+    A checkpoint that cannot be read, or that another version wrote, is set aside, and training starts anew.
 
     Args:
         module: holds its final weights in the block, or with `monitor` those of the epoch where it was best.
@@ -144,7 +144,7 @@ def trained(
     if target is not None:
         check_writable(target, folder=True)
     check_writable(run / "last.ckpt", folder=False)
-    checkpoint = _checkpoint(run, ("last",) if monitor is None else ("last", "best"))
+    checkpoint = _checkpoint(run, ("last",) if monitor is None else ("last", "best"), module)
     curves = Curves()
     # in front the guard: an epoch that diverged is in no checkpoint
     keepers = [Guard(), *callbacks, *_keepers(run, curves, monitor, mode)]
@@ -184,33 +184,40 @@ def _keepers(run: Path, curves: Curves, monitor: str | None, mode: Literal["min"
     return [best, curves, last]
 
 
-def _checkpoint(run: Path, names: Sequence[str]) -> Path | None:
-    """The run's last checkpoint, where those of all these names can be read; else all are set aside."""
+def _checkpoint(run: Path, names: Sequence[str], module: nn.Module) -> Path | None:
+    """The run's last checkpoint, where those of all these names fit the module; else all are set aside."""
     for orphan in run.glob(".*.partial"):  # of a process that was killed as it wrote
         orphan.unlink()
     paths = [run / f"{name}.ckpt" for name in names]
     if not (run / "last.ckpt").exists():
         return None
-    damaged = next((path for path in paths if not _readable(path)), None)
-    if damaged is None:
+    faults = ((path, _fault(path, module)) for path in paths)
+    found = next(((path, fault) for path, fault in faults if fault), None)
+    if found is None:
         return run / "last.ckpt"
     for path in paths:  # together, since one without the other would lead a later run astray
         if path.exists():
             path.replace(path.with_name(f"{path.name}.unreadable"))
-    sentence = f"{damaged} is damaged or missing, as after a power cut: it is set aside, and training starts anew."
+    sentence = f"{found[0]} {found[1]}: it is set aside, and training starts anew."
     Console(stderr=True).print(sentence, style="yellow", markup=False, highlight=False, soft_wrap=True)
     return None
 
 
-def _readable(checkpoint: Path) -> bool:
+def _fault(checkpoint: Path, module: nn.Module) -> str | None:
+    """What is wrong with a checkpoint for this module, if anything."""
+    damaged = "is damaged or missing, as after a power cut"
     if not checkpoint.is_file():  # or a pipe, which would never end
-        return False
+        return damaged
     try:
-        return "state_dict" in torch.load(checkpoint, map_location="cpu", weights_only=True)
+        saved = torch.load(checkpoint, map_location="cpu", weights_only=True)["state_dict"]
+        shapes = {name: value.shape for name, value in saved.items()}
     except (OSError, MemoryError):  # says nothing about the file
         raise
     except Exception:  # whatever unpickling raises
-        return False
+        return damaged
+    if shapes != {name: value.shape for name, value in module.state_dict().items()}:
+        return "holds other weights than this version trains, as after an upgrade"
+    return None
 
 
 def freeze(module: nn.Module, parts: Sequence[str]) -> None:

@@ -133,7 +133,7 @@ def test_a_checkpoint_that_is_a_pipe_is_set_aside(tmp_path: Path) -> None:
     run = run_folder(tmp_path, "stage", {}, [])
     run.mkdir(parents=True)
     os.mkfifo(run / "last.ckpt")
-    assert _checkpoint(run, ("last",)) is None
+    assert _checkpoint(run, ("last",), torch.nn.Linear(1, 1)) is None
     assert [path.name for path in run.iterdir()] == ["last.ckpt.unreadable"]
 
 

@@ -201,6 +201,22 @@ def test_a_damaged_checkpoint_is_set_aside_and_training_starts_anew(root, monkey
     assert f"{name}.ckpt is damaged or missing" in sentence and "training starts anew" in sentence
 
 
+def test_a_checkpoint_of_another_version_is_set_aside(root, monkeypatch, capsys):
+    expected = train_whole(root)
+    with monkeypatch.context() as patch:
+        kill_in_epoch(patch, 2)
+        with pytest.raises(Killed):
+            train_whole(root)
+    (run,) = (root / ".envtf/runs").iterdir()
+    saved = torch.load(run / "last.ckpt", weights_only=True)
+    saved["state_dict"]["horizon"] = torch.zeros(3)
+    torch.save(saved, run / "last.ckpt")
+    capsys.readouterr()
+    assert train_whole(root) == expected
+    (sentence,) = capsys.readouterr().err.strip().splitlines()
+    assert "last.ckpt holds other weights than this version trains" in sentence and "anew" in sentence
+
+
 def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(root, monkeypatch):
     expected = train_whole(root)
     synced: list[int] = []
