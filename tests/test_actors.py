@@ -116,3 +116,18 @@ def test_no_action_is_given_for_what_no_sensor_measures(cls: type[Actor], value:
     assert not unguarded.act(torch.full((1, S), math.nan)).isfinite().any()
     graph = torch.export.export(actor, (observation,))  # which cannot raise
     assert "isfinite" not in str(graph.graph)
+
+
+def test_least_squares_are_the_log_of_the_mean_action_s_error():
+    torch.manual_seed(0)
+    actor = TanhGaussianActor(3, 2, hidden=(8,), action_low=[-2.0, 0.0], action_high=[2.0, 1.0])
+    observation = torch.randn(500, 3)
+    halves = torch.tensor([2.0, 0.5])  # of the range
+    missed = torch.tensor([0.1, 0.01])  # of those
+    action = actor.act(observation) + halves * missed * torch.randn(500, 2).sign()
+    error = actor.least_squares(observation, action)
+    assert error.item() == pytest.approx(float(missed.log().mean()), abs=1e-3)
+    gradient = torch.autograd.grad(error, list(actor.net.parameters()))
+    assert all(bool(g.isfinite().all()) for g in gradient) and any(float(g.abs().sum()) > 0 for g in gradient)
+    exact = actor.least_squares(observation, actor.act(observation))
+    assert exact.item() == pytest.approx(math.log(1e-3), abs=1e-3)  # no finer than this is asked for

@@ -61,6 +61,25 @@ def test_the_clone_is_the_actor_that_was_likeliest_on_held_out_rows():
     assert errors[0] == float(trust.look(actors[0]))  # the same rows at each look
 
 
+def test_a_clone_that_explains_the_actions_is_the_first_of_a_better_kind():
+    """From there on least squares are part of its loss, and the likelihood before no longer counts."""
+    data = linear_data(EPISODES)
+    actor = make_actor()
+    decided = replace(data, actions=actor.act(torch.as_tensor(data.observations)).numpy())
+    trust = Trust(actor)
+    trust.begin(DrawnRows(decided), 0, CPU)
+    other = sure(0.0)
+    trust.look(other)
+    assert not trust.determined
+    trust.best.fill_(-100.0)  # a likelihood that no spread of `actor` reaches
+    trust.look(actor)
+    assert trust.determined and float(trust.best) > -100.0
+    assert torch.equal(flat(trust.clone.state_dict()), flat(actor.state_dict()))
+    best = float(trust.best)
+    trust.look(other)
+    assert trust.determined and float(trust.best) == best
+
+
 def test_the_warm_start_ends_with_the_clone_not_with_what_was_learned_by_heart(monkeypatch):
     monkeypatch.setattr(trust_module, "CHECK_EVERY", 10)
     monkeypatch.setattr(trust_module, "LEARNING_RATE", 0.03)

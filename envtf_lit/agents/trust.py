@@ -17,6 +17,7 @@ CHECKED = 8_192  # rows of each look
 ROWS = 512  # likewise, at each update of the dual variable
 FIRST, LEAST, MOST = 0.05, 1e-3, 100.0  # the dual variable at the start, and between which it stays
 RATE = 0.3  # of its logarithm's ascent, per nat
+DETERMINED = 0.1  # of held-out actions' variance: a clone that leaves less unexplained shows that states decide them
 
 
 class Trust(nn.Module):
@@ -31,16 +32,19 @@ class Trust(nn.Module):
     Attributes:
         clone: the actor where it was likeliest on held-out rows.
         best: (), its error there (`Actor.clone_error`).
+        determined: () bool, whether some look found that the log's actions are a function of its states.
         rows: to watch; None before there is a log.
     """
 
     best: Tensor
+    determined: Tensor
     log_weight: Tensor
 
     def __init__(self, actor: Actor) -> None:
         super().__init__()
         self.clone = copy.deepcopy(actor).requires_grad_(False)
         self.register_buffer("best", torch.tensor(math.inf))
+        self.register_buffer("determined", torch.tensor(False))
         self.register_buffer("log_weight", torch.tensor(math.log(FIRST)))
         self.rows: DrawnRows | None = None
 
@@ -51,8 +55,13 @@ class Trust(nn.Module):
 
     @torch.no_grad()
     def look(self, actor: Actor) -> Tensor:
-        """() the actor's error on held-out rows; the clone is the best so far."""
-        error = actor.clone_error(self.looked_at["observations"], self.looked_at["actions"]).mean()
+        """() the actor's error on held-out rows; the clone is the best so far, of those of one way to clone."""
+        observations, actions = self.looked_at["observations"], self.looked_at["actions"]
+        error = actor.clone_error(observations, actions).mean()
+        left = (actor.act(observations) - actions).square().mean(0).sum() / actions.var(0).sum()
+        if not self.determined and left < DETERMINED:
+            self.determined.fill_(True)
+            self.best.fill_(math.inf)
         if error < self.best:
             self.best.copy_(error)
             self.clone.load_state_dict(actor.state_dict())
