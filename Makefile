@@ -44,7 +44,7 @@ else
 	  echo "Done: $$copy/reports/report.html (the copy is yours to keep or delete)"
 endif
 
-# Those whose notebook or package did not change since are not executed again.
+# Those whose notebook or package did not change since are not executed again, but for that on the comparison's results.
 tutorials: .venv/.installed .dvc/tmp/.ready
 	dvc repro notebooks/dvc.yaml
 	@echo "Done: reports/notebooks"

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from envtf_lit.comparison.findings import Standing, first_alone
+from envtf_lit.comparison.findings import Standing, first_alone, model_of
 from envtf_lit.comparison.grid import KITS
 from envtf_lit.comparison.references import TASK_SETS
 from envtf_lit.comparison.statistics import Estimate, mean_over_seeds
@@ -131,8 +131,12 @@ def _firsts(view: View, name: str) -> Claim:
 
 def _fastest(view: View, standings: Mapping[str, Standing], name: str) -> Claim:
     said = "It learns fastest of those with a world model."
-    shares = {other: s.reached for other, s in standings.items() if s.model_seconds is not None or other == name}
-    known = {other: share for other, share in shares.items() if share is not None}
+    some = {run.algorithm: run for run in view.runs}
+    known = {
+        other: standing.reached
+        for other, standing in standings.items()
+        if standing.reached is not None and model_of(some[other]) is not None
+    }
     if name not in known or len(known) < 2:
         return Claim(said, "–", "open", "no runs of a second algorithm with a world model")
     own = known.pop(name)
@@ -147,6 +151,6 @@ def _cheaper(standings: Mapping[str, Standing], name: str) -> Claim:
     others: Iterator[float] = (seconds for other, seconds in times.items() if other not in CLAIMANT.values())
     ensemble = max(others, default=None)
     if name not in times or ensemble is None:
-        return Claim(said, "–", "open", "no runs that imagine in an ensemble")
+        return Claim(said, "–", "open", "no runs of both kinds of model, with their seconds")
     found = f"{times[name]:,.0f} s against {ensemble:,.0f} s"
     return Claim(said, found, "reproduces" if times[name] < ensemble else "does not", "medians over tasks")

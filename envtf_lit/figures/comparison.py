@@ -152,7 +152,7 @@ def runs_there(counts: pd.DataFrame, path: str | Path, *, planned: int) -> Path:
     """
     with drawing(path, (0.85 * counts.shape[1] + 2.4, 0.26 * len(counts) + 1.6)) as (_, axes):
         axis = axes[0, 0]
-        axis.imshow(counts.to_numpy(), cmap="Greys", vmin=0, vmax=1.6 * planned, aspect="auto")
+        axis.imshow(counts.to_numpy(), cmap="Greys", vmin=0, vmax=2.2 * planned, aspect="auto")
         for row, column in np.ndindex(counts.shape):
             number = counts.iat[row, column]
             axis.text(column, row, f"{number}" if number else "·", ha="center", va="center", fontsize="small")
