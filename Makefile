@@ -45,7 +45,7 @@ else
 endif
 
 # Those whose notebook or package did not change since are not executed again, but for that on the comparison's results.
-tutorials: .venv/.installed .dvc/tmp/.ready
+tutorials: .venv/.installed-dev .dvc/tmp/.ready
 	dvc repro notebooks/dvc.yaml
 	@echo "Done: reports/notebooks"
 

@@ -1,8 +1,9 @@
 """Policies: the protocol that everything acting follows, and those that are saved in folders."""
 
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -45,6 +46,36 @@ class RandomPolicy:
         size = (len(observation), len(self.action_low))
         uniform = torch.rand(size, generator=generator, device=self.action_low.device)
         return self.action_low + uniform * (self.action_high - self.action_low)
+
+
+class Predictor(Protocol):
+    """What stable-baselines3's learners (and sbx's) have in common."""
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, Any]:
+        """Observations (B, S) to actions (B, A)."""
+        ...
+
+
+class PredictingPolicy:
+    """A learner of stable-baselines3 as a policy, for all that plays and scores policies.
+
+    Args:
+        learner: trained, on flat observations; what it draws comes from its own random numbers.
+    """
+
+    def __init__(self, learner: Predictor) -> None:
+        self.learner = learner
+
+    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
+        """Observations (B, S) to actions (B, A); `generator` has nothing to draw here."""
+        actions, _ = self.learner.predict(observation.cpu().numpy(), deterministic=deterministic)
+        return torch.from_numpy(actions).to(observation.device)
 
 
 def save_policy(folder: str | Path, actor: Actor) -> None:

@@ -10,7 +10,16 @@ from analytic import LinearWorld, linear_data, linear_world
 from PIL import Image
 from torch import Tensor
 
-from envtf_lit.evaluation.in_context import HISTORY, InContextError, in_context_error, in_context_metrics, stretches
+from envtf_lit.evaluation.in_context import (
+    HISTORY,
+    InContextError,
+    doubt_by_history,
+    errors_on_the_way,
+    in_context_error,
+    in_context_metrics,
+    steps_to_settle,
+    stretches,
+)
 from envtf_lit.figures.in_context import in_context_curves
 from envtf_lit.world_models.forecast import Scale
 
@@ -48,6 +57,32 @@ def test_errors_are_sorted_by_what_the_model_has_seen() -> None:
     np.testing.assert_allclose(one_step[:, :8], np.tile(expected, (3, 1)), rtol=1e-2)
     # the open loop is shown nothing more: its error stays that after 16 steps of history
     assert open_loop.max() < unit * 0.25**HISTORY * 1.1 + 1e-10
+
+
+def test_doubt_is_the_error_beside_the_spread_that_is_told() -> None:
+    data = linear_data((100, 100))
+    scale, pieces = Scale.of(data), stretches(linear_data((100, 100)), 20, seed=0)
+    found = doubt_by_history(remembering(), pieces, scale)
+    unit = 1.0 / (scale.std[0].item() * int(scale.live.sum()) ** 0.5)
+    np.testing.assert_allclose(found.error[:8], unit * 0.5 ** np.arange(8), rtol=1e-2)
+    world = linear_world(std=0.3)
+    told = doubt_by_history(world, pieces, scale).told
+    expected = (0.3 / scale.std[scale.live]).square().mean().sqrt().item()
+    np.testing.assert_allclose(told, expected, rtol=1e-5)
+
+
+def test_errors_on_the_way_are_quartiles_of_each_step() -> None:
+    data = linear_data((100, 100))
+    scale = Scale.of(data)
+    found = errors_on_the_way(remembering(), stretches(data, 20, seed=0), scale)
+    assert found.shape[0] == 3 and (np.diff(found[1][:6]) < 0).all()
+
+
+def test_a_curve_has_settled_once_it_is_near_its_end() -> None:
+    curve = np.array([1.0, 1.0, 8.0, 4.0, 2.0, 1.4, 1.0, 1.0, 1.0, 1.0])
+    assert steps_to_settle(curve, 2) == 3  # from 8 on: 1.4 is the first within 1.5 of 1
+    assert steps_to_settle(curve, 0) == 0
+    assert steps_to_settle(np.full(4, np.nan), 0) is None
 
 
 def test_metrics_are_medians_and_shares_of_the_other_models() -> None:

@@ -1,17 +1,15 @@
 """Stock learners in the imagined environment: the wrappers of stable-baselines3 and TorchRL, and SAC."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import DummyVecEnv
-from torch import Tensor
 
 from envtf_lit.imagination.env import ImaginedEnv
+from envtf_lit.policy import PredictingPolicy
 from envtf_lit.studies.planning import PlanningOptions, learned_pendulum, play
 from tests.test_imagined_env import imagined
 
@@ -37,16 +35,6 @@ def test_torchrl_accepts_it():
     assert rollout["next", "truncated"].sum() == 1 and len(rollout) == 5
 
 
-class Learned:
-    """A stable-baselines3 model as a policy."""
-
-    def __init__(self, model: Any) -> None:
-        self.model = model
-
-    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
-        return torch.from_numpy(self.model.predict(observation.numpy(), deterministic=deterministic)[0])
-
-
 @pytest.mark.slow
 def test_a_stock_sac_that_never_saw_the_pendulum_swings_it_up(tmp_path: Path):
     """Trained in a world model of random steps alone; scored in the simulator, where it began at about -1,300."""
@@ -54,6 +42,6 @@ def test_a_stock_sac_that_never_saw_the_pendulum_swings_it_up(tmp_path: Path):
     folder = learned_pendulum(tmp_path, options, progress=False)
     env = ImaginedEnv(folder, tmp_path / "random.h5", max_steps=100, starts="rows", novelty_limit=None, history=1)
     agent = SAC("MlpPolicy", env, learning_starts=200, learning_rate=1e-3, seed=0, policy_kwargs={"net_arch": [64, 64]})
-    before = play(Learned(agent), options).mean()
+    before = play(PredictingPolicy(agent), options).mean()
     agent.learn(4_000)
-    assert play(Learned(agent), options).mean() > max(-400.0, before + 500.0)
+    assert play(PredictingPolicy(agent), options).mean() > max(-400.0, before + 500.0)

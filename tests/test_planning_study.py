@@ -5,6 +5,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +19,19 @@ from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.planning import planner_of, score_planner
 from envtf_lit.planning.objective import imagined_paths
-from envtf_lit.policy import save_policy
+from envtf_lit.planning.pendulum import TruePendulum
+from envtf_lit.policy import PredictingPolicy, save_policy
 from envtf_lit.robots.tasks import ROBOTS
-from envtf_lit.studies.planning import FAMILIES, PlanningOptions, planning_table, run_planning
+from envtf_lit.studies.planning import (
+    FAMILIES,
+    PlanningOptions,
+    angles,
+    picture,
+    planning_table,
+    play,
+    run_planning,
+    watch,
+)
 from envtf_lit.world_models.store import load_world_model, save_world_model
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.logs import dataset_of_chains
@@ -125,6 +136,30 @@ def test_a_policy_of_another_robot_is_refused(hopper_model: Path, tmp_path: Path
     save_policy(tmp_path / "policy", TanhGaussianActor(17, 6, hidden=(8,)))
     with pytest.raises(UserError, match="policy of observations of size 17, and hopper has 11"):
         score_planner(hopper_model / "model", ROBOTS["hopper"], "mppi", policy=tmp_path / "policy", episodes=1, seed=0)
+
+
+class Constant:
+    """A learner with stable-baselines3's way to ask for actions, who always pushes alike."""
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, None]:
+        return np.full((len(observation), 1), 1.5 if deterministic else 0.5, np.float32), None
+
+
+def test_an_episode_that_is_watched_is_the_one_that_is_played():
+    policy, options = PredictingPolicy(Constant()), PlanningOptions(episodes=1, steps=7, seed=3)
+    seen = watch(policy, seed=3, steps=7)
+    rate = np.diff(np.unwrap(angles(seen))) / 0.05
+    assert seen.shape == (8, 3) and np.allclose(rate, seen[1:, 2], atol=1e-4)
+    paid = -(angles(seen[:-1]) ** 2 + 0.1 * seen[:-1, 2] ** 2 + 0.001 * 1.5**2).sum()
+    assert play(policy, options)[0] == pytest.approx(paid, rel=1e-4)
+    assert policy.act(torch.zeros(2, 3), False).tolist() == [[0.5], [0.5]]
+
+
+def test_a_plan_is_drawn_of_the_planner_that_is_named():
+    found = picture(TruePendulum(), 0, "mppi", SMALL["mppi"])
+    assert found.title == "mppi" and found.taken[1].shape == (1, SMALL["mppi"].horizon)
 
 
 @pytest.mark.slow

@@ -77,3 +77,46 @@ def in_context_metrics(found: Mapping[str, InContextError]) -> dict[str, Any]:
         for kind in ("one_step", "open_loop"):
             metrics[f"transformer.{kind}_vs_{name}"] = metrics[f"transformer.{kind}"] / metrics[f"{name}.{kind}"]
     return metrics
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """How wrong a model is one step ahead, and how wrong it says that it is, by the steps of history it was shown.
+
+    Attributes:
+        error: (T,) root mean square over stretches and live dimensions of the error, in standard deviations.
+        told: (T,) likewise of the predicted standard deviation; equal to `error` where the model knows its errors.
+    """
+
+    error: np.ndarray
+    told: np.ndarray
+
+
+def doubt_by_history(model: WorldModel, trajectories: Trajectories, scale: Scale) -> Doubt:
+    """A model's errors and predicted spreads one step ahead, with all of a stretch's true history.
+
+    Args:
+        model: in eval mode, on the trajectories' device.
+        trajectories: all of the same length, as of `stretches`.
+        scale: the units.
+    """
+    found = forecast(model, trajectories, feedback="recorded")
+    error = nmse(found.mean, trajectories, scale)
+    told = (found.std / scale.std)[..., scale.live].double().square().mean(-1)
+    return Doubt(*(column.mean(0).sqrt().cpu().numpy() for column in (error, told)))
+
+
+def errors_on_the_way(model: WorldModel, trajectories: Trajectories, scale: Scale) -> np.ndarray:
+    """(3, T) quartiles over episodes of the error one step ahead (nmse), at each step of episodes of equal length."""
+    error = nmse(forecast(model, trajectories, feedback="recorded").mean, trajectories, scale)
+    return np.quantile(error.cpu().numpy(), QUANTILES, axis=0)
+
+
+def steps_to_settle(errors: np.ndarray, at: int, *, within: float = 1.5) -> int | None:
+    """Steps after `at` until a curve of errors (T,) first is within a factor of where it ends; None: it never is.
+
+    Where it ends is the median of its last quarter after `at`.
+    """
+    after = errors[at:]
+    settled = np.flatnonzero(after <= within * np.median(after[-max(1, len(after) // 4) :]))
+    return int(settled[0]) if len(settled) else None

@@ -51,7 +51,8 @@ def frontier_picture(
                 axis.axvline(found.slack, color=COLOURS["threshold"], linestyle=":", linewidth=1.2)
                 note = f"{level}:\nno further"
                 axis.annotate(note, (found.slack, 1.0), xycoords=("data", "axes fraction"), xytext=(-3, -3),
-                              textcoords="offset points", ha="right", va="top", fontsize="x-small")  # fmt: skip
+                              textcoords="offset points", ha="right", va="top", fontsize="x-small",
+                              bbox=dict(facecolor=axis.get_facecolor(), linewidth=0, pad=1.0))  # fmt: skip
         axis.set(
             xlabel="distance from the log: how much likelier the clone makes held-out actions (nats per dimension)"
         )

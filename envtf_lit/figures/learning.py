@@ -27,6 +27,8 @@ TITLES = {
     "clone_loss": "-log density of real actions",
     "actor_loss": "actor loss",
     "imagined_value": "imagined return, through the model",
+    "trust_weight": "weight of the clone loss",
+    "cut_share": "share of imagined paths that were cut",
     "value_loss": "state value loss",
     "entropy": "entropy of the policy (nats)",
     "alpha": "temperature alpha",

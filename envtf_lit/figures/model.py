@@ -104,8 +104,8 @@ def calibration_curve(report: HorizonReport, scale: Scale, robot: str | None, pa
 def traces(report: HorizonReport, robot: str | None, path: str | Path, *, steps: int = 200) -> Path:
     """Recorded and imagined (open-loop) values of featured dimensions along the held-out episode of median quality.
 
-    The band is twice the predicted standard deviation of a single step, given the imagined state before it. The median
-    is that of the number of steps within nmse 0.1.
+    The reward takes a free panel. The band is twice the predicted standard deviation of a single step, given the
+    imagined state before it. The median is that of the number of steps within nmse 0.1.
     """
     lengths = report.trajectories.lengths
     within, _ = steps_within(report.open_loop_nmse, lengths, 0.1)
@@ -115,10 +115,13 @@ def traces(report: HorizonReport, robot: str | None, path: str | Path, *, steps:
         x[row, :end].cpu().numpy()
         for x in (report.trajectories.targets, report.open_loop_forecast.mean, report.open_loop_forecast.std)
     )  # fmt: skip
-    labels, h = observation_labels(robot, recorded.shape[-1] - 1), np.arange(1, end + 1)
+    labels, h = [*observation_labels(robot, recorded.shape[-1] - 1), "reward"], np.arange(1, end + 1)
+    shown = [*featured(len(labels) - 1), len(labels) - 1][:4]
     tables = []
     with drawing(path, (10.0, 5.6), 2, 2) as (figure, axes):
-        for axis, i in zip(axes.flat, featured(len(labels)), strict=False):
+        for axis in axes.flat[len(shown) :]:
+            axis.remove()
+        for axis, i in zip(axes.flat, shown, strict=False):
             band = {"lower": mean[:, i] - 2 * std[:, i], "upper": mean[:, i] + 2 * std[:, i]}
             axis.fill_between(
                 h, band["lower"], band["upper"], color=COLOURS["imagined"], alpha=0.25, lw=0, label="±2 std"
@@ -134,7 +137,7 @@ def traces(report: HorizonReport, robot: str | None, path: str | Path, *, steps:
                     {"quantity": labels[i], "step": h, "recorded": recorded[:, i], "imagined": mean[:, i], **band}
                 )
             )
-        for axis in axes[-1]:
+        for axis in axes.flat[: len(shown)][-2:]:
             axis.set_xlabel("step")
         axes[0, 1].legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
         figure.suptitle("A held-out episode of median quality, imagined from its first state and its actions alone")

@@ -7,6 +7,7 @@ from textwrap import fill
 import numpy as np
 import pandas as pd
 import seaborn as sns
+from matplotlib.ticker import MaxNLocator
 
 from envtf_lit.figures.style import COLOURS, LABELS, drawing, policy_colours, write_table
 
@@ -73,7 +74,9 @@ def returns_histogram(returns: np.ndarray, lengths: np.ndarray, path: str | Path
             mean = values.mean()
             axis.axvline(mean, color="black", linestyle="--", linewidth=1.2, label=f"mean {mean:.0f}")
             axis.set(xlabel=f"episode {label}", ylabel="episodes")
+            axis.yaxis.set_major_locator(MaxNLocator(integer=True))
             axis.legend()
+        axes[0, 1].xaxis.set_major_locator(MaxNLocator(integer=True))
         figure.suptitle(f"The dataset's {len(returns):,} episodes")
     write_table(path, pd.DataFrame({"return": returns, "length": lengths}))
     return Path(path)

@@ -228,16 +228,33 @@ def play(policy: Policy, options: PlanningOptions) -> np.ndarray:
     return returns
 
 
-def picture(model: WorldModel, seed: int) -> PlanPicture:
-    """A plan from the pendulum at rest, hanging, as `SHOWN` finds it: its angle, upright at 0, and its torque."""
-    planner = PLANNERS[SHOWN](model, *RANGE, seed=seed)
+def watch(policy: Policy, *, seed: int, steps: int) -> np.ndarray:
+    """Observations (steps + 1, 3) of one episode of Pendulum-v1 under deterministic actions."""
+    env = gymnasium.make(ENV_ID, max_episode_steps=steps)
+    seen = [env.reset(seed=seed)[0]]
+    begin_episodes(policy)
+    for _ in range(steps):
+        action = policy.act(torch.from_numpy(seen[-1])[None], True)
+        seen.append(env.step(action[0].numpy())[0])
+    env.close()
+    return np.stack(seen)
+
+
+def angles(observations: np.ndarray) -> np.ndarray:
+    """Angles (...) in rad of observations (..., 3), upright at 0."""
+    return np.arctan2(observations[..., 1], observations[..., 0])
+
+
+def picture(model: WorldModel, seed: int, family: str = SHOWN, own: PlannerOptions | None = None) -> PlanPicture:
+    """A plan from the pendulum at rest, hanging, as one family finds it: its angle, upright at 0, and its torque."""
+    planner = PLANNERS[family](model, *RANGE, own, seed=seed)
     found = planner.search(torch.tensor([[-1.0, 0.0, 0.0]]))
     groups = found.candidates, chosen(found.candidates, found.elites), found.taken[:, None]
     curves = [_curves(model, planner.state, planner.scaled(plans)) for plans in groups]
-    return PlanPicture(*curves, step=STEP, labels=("angle (rad)", "torque (N m)"), title=SHOWN)
+    return PlanPicture(*curves, step=STEP, labels=("angle (rad)", "torque (N m)"), title=family)
 
 
 def _curves(model: WorldModel, state: Any, plans: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Angles (N, H + 1), continued beyond half a turn, and torques (N, H) of plans (1, N, H, 1)."""
     seen = imagined_paths(model, state, plans)[0].numpy()
-    return np.unwrap(np.arctan2(seen[..., 1], seen[..., 0]), axis=1), plans[0, ..., 0].numpy()
+    return np.unwrap(angles(seen), axis=1), plans[0, ..., 0].numpy()
