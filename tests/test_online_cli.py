@@ -141,7 +141,8 @@ def test_values_may_be_as_large_as_the_rewards_that_were_met_allow(
 
 
 def written() -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(Path(".envtf/published").iterdir())}
+    """Every file that was published, critics among them."""
+    return {str(path): path.read_bytes() for path in sorted(Path(".envtf/published").rglob("*")) if path.is_file()}
 
 
 CASES = {
