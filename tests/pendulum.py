@@ -1,6 +1,6 @@
 """Gymnasium's Pendulum learned online, and what agents make of the log that this leaves.
 
-`python -m tests.pendulum` measures the tables of docs/known_answers.md, seed by seed.
+`python -m tests.pendulum` measures the tables of docs/finetuning.md, seed by seed.
 """
 
 import tempfile

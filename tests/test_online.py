@@ -52,9 +52,10 @@ def test_what_is_drawn_is_what_a_log_of_the_same_episodes_gives(
     """Where the log is cut it says so, which here is at the newest rows."""
     steps = lived(environments, 90)
     monkeypatch.setattr("envtf_lit.online.replay.FIRST_SIZE", 16)  # it grows on the way
-    replay = Replay(environments, 1_000)
+    replay, generator = Replay(environments, 1_000), torch.Generator()
     for rows in steps:
         replay.add(rows)
+        replay.draw(64, generator, discount=0.9, n_step=n_step)  # also when it is full
     log = Transitions(logged(steps), discount=0.9, n_step=n_step)
     place = torch.arange(90 * environments)  # of the replay's rows, (T, E), in the log, (E, T)
     place = place % environments * 90 + place // environments

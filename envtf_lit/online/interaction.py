@@ -58,7 +58,7 @@ class Interaction:
         Raises:
             UserError: an action is not finite.
         """
-        observations = torch.from_numpy(self.observations)
+        observations = torch.tensor(self.observations)  # a copy: matrix products may round by where NumPy's memory lies
         actions = act(observations)
         if not actions.isfinite().all():
             raise UserError(

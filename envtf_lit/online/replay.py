@@ -48,6 +48,7 @@ class Replay:
         E = self.environments
         rows = torch.randint(self.added - len(self), self.added, (count,), generator=generator, device=self.device)
         path = rows[:, None] + E * torch.arange(n_step, device=self.device)  # (count, n)
+        path = path.clamp(max=self.added - 1)  # what comes later is not taken, and there may be no room for it yet
         ended = self._at("terminated", path) | self._at("truncated", path)
         goes_on = ~ended & (path + E < self.added)
         taken = torch.cat([torch.ones_like(goes_on[:, :1]), goes_on[:, :-1].cumprod(1).bool()], 1)
