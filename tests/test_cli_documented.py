@@ -11,10 +11,11 @@ from typing import Any
 
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.cli.commands import COMMANDS, GROUPS
-from envtf_lit.cli.lightning_modules import LogTransitions, LogWindows, agent_of, world_model_of
+from envtf_lit.cli.lightning_modules import LogTransitions, LogWindows, OnlineTransitions, agent_of, world_model_of
 from envtf_lit.cli.signatures import parse_words
 from envtf_lit.cli.stages import STAGES, StageParser, split
 from envtf_lit.data.datamodules import TransitionData, WindowData
+from envtf_lit.online.data import OnlineData
 from envtf_lit.pipeline.yaml import load_params
 from envtf_lit.world_models.options import KINDS
 from tests.test_cli import LIGHTNING
@@ -68,6 +69,8 @@ def known_flags(name: str, words: Sequence[str]) -> set[str]:
     model = world_model_of(chosen[0]) if name == "model" else agent_of(chosen[0])
     options = dataclasses.fields(cls if name == "model" else cls.Options)
     data = (WindowData, LogWindows) if name == "model" else (TransitionData, LogTransitions)
+    if name == "agent" and "online" in words:
+        data = (TransitionData, OnlineData, OnlineTransitions)
     flags = {f"--model.{key}" for key in inspect.signature(model).parameters}
     flags |= {f"--model.options.{field.name}" for field in options}
     flags |= {f"--data.{key}" for reader in data for key in inspect.signature(reader).parameters}

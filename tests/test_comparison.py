@@ -114,6 +114,11 @@ def test_unknown_names_are_refused_with_the_nearest(names: dict[str, list[str]],
         grid(BUDGET, **names)  # pyright: ignore[reportArgumentType]
 
 
+def test_a_seed_that_is_named_twice_is_refused() -> None:
+    with pytest.raises(UserError, match="Seed 3 is named twice, which is the same run"):
+        grid(BUDGET, seeds=[3, 1, 3])
+
+
 # settings
 
 

@@ -72,6 +72,7 @@ BAD = {
     "no timeouts": (drop("truncated"), "there is no 'truncated' (or 'timeouts'): store both flags"),
     "short": (change("actions", lambda x: x[:-1]), "'actions' has 11 rows and 'observations' has 12"),
     "rank 1": (change("observations", lambda x: x[:, 0]), "'observations' has shape (12,): reshape it to"),
+    "choices": (put("actions", np.arange(12) % 3), "'actions' has shape (12,): if they number choices, take another"),
     "rank 2": (change("rewards", lambda x: x[:, None]), "'rewards' has shape (12, 1)"),
     "scalar": (put("rewards", 1.0), "'rewards' has shape ()"),
     "narrow": (change("next_observations", lambda x: x[:, :3]), "(12, 3) and 'observations' (12, 11): make them equal"),
@@ -118,7 +119,7 @@ def test_bad_content_is_named_with_its_fix(case: str):
     assert not any("\n" in text for text in found)
 
 
-@pytest.mark.parametrize("case", ["short", "rank 1", "rank 2", "scalar", "narrow", "no dimensions", "zero rows"])
+@pytest.mark.parametrize("case", ["short", "rank 1", "choices", "rank 2", "scalar", "narrow", "no dimensions", "zero rows"])
 def test_one_misshapen_column_is_one_error(case: str):
     content = columns()
     BAD[case][0](content)

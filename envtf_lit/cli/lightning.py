@@ -13,17 +13,20 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from envtf_lit.agents.options import NO_WORLD_MODEL
 from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.cli.arguments import SHIPPED, given, of_today, with_shipped_configs
-from envtf_lit.cli.lightning_modules import LogTransitions, LogWindows, agent_of, world_model_of
+from envtf_lit.cli.lightning_modules import SOURCES, LogWindows, OnlineTransitions, agent_of, world_model_of
 from envtf_lit.cli.publish import KeepConfig, Publish
 from envtf_lit.cli.saved_options import (
     checkpoint_class,
     checkpoint_options,
+    learned_online,
     model_architecture,
     model_kind,
     policy_architecture,
 )
+from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.options import UPDATES_PER_STEP, DownloadOptions
 from envtf_lit.errors import UserError, did_you_mean
+from envtf_lit.online.evaluation import Evaluation
 from envtf_lit.options.schema import build
 from envtf_lit.pipeline.params import Params
 from envtf_lit.training import Curves, Guard, WholeCheckpoints
@@ -239,7 +242,7 @@ def _run(kind: str, arguments: list[str]) -> None:
         name = _chosen("algorithm", arguments, classes, "cql")
         if ALGORITHMS[name].imagines:
             raise UserError(f"{name} needs a world model: add it below train_policy in params.yaml, and `dvc repro`.")
-        cli, model, data, options = AgentCLI, agent_of(name), LogTransitions, classes[name]
+        cli, model, data, options = AgentCLI, agent_of(name), _source(arguments), classes[name]
     made = type(cli.__name__, (cli,), {"options": options, "chosen": name})
     made(
         model,
@@ -249,7 +252,7 @@ def _run(kind: str, arguments: list[str]) -> None:
         auto_configure_optimizers=False,
         trainer_defaults={
             "default_root_dir": ".envtf",
-            "callbacks": [Publish()],
+            "callbacks": [Publish(), *([Evaluation()] if data is OnlineTransitions else [])],
             "use_distributed_sampler": False,  # the samplers share draws among processes themselves
         },
         save_config_callback=KeepConfig,
@@ -259,6 +262,20 @@ def _run(kind: str, arguments: list[str]) -> None:
             "description": f"{(model.__doc__ or '').splitlines()[0]} {TRUST}",
         },
     )
+
+
+def _source(arguments: list[str]) -> type[TransitionData]:
+    """The data module of `--data.source`, on which the other options of the data depend.
+
+    Raises:
+        UserError: it is unknown, or a run that learned online shall go on without.
+    """
+    source, checkpoint = given("data.source", arguments) or "file", given("ckpt_path", arguments)
+    if source not in SOURCES:
+        raise UserError(f"--data.source is {source!r}: {did_you_mean(source, SOURCES)}")
+    if source != "online" and checkpoint is not None and learned_online(checkpoint):
+        raise UserError(f"{checkpoint} is of a run that learns online: add --data.source online, and its data's flags.")
+    return SOURCES[source]
 
 
 def _chosen(tag: str, arguments: list[str], classes: Mapping[str, type], default: str) -> str:

@@ -10,6 +10,7 @@ from envtf_lit.data.datamodules import TransitionData, WindowData
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.data.sources.minari import read_minari
+from envtf_lit.online.data import OnlineData
 from envtf_lit.world_models.lit import LitWorldModel, lit_world_model
 from envtf_lit.world_models.options import KINDS
 
@@ -122,6 +123,26 @@ class LogTransitions(_Sourced, TransitionData):
 
     Args:
         path: dataset file, HDF5 or NPZ, or a Minari dataset's id or folder.
-        source: which of the two: `file` or `minari`.
+        source: which of the two: `file` or `minari`. With `online` there are other options: add it to see them.
         options: see `TransitionData`.
     """
+
+
+class OnlineTransitions(OnlineData):
+    """An agent's own experience in an environment, and a log's rows beside it.
+
+    Args:
+        source: `online`.
+        options: see `OnlineData`.
+    """
+
+    def __init__(self, source: Literal["online"] = "online", **options: Any) -> None:
+        self.source = source
+        super().__init__(**options)
+
+
+SOURCES: dict[str, type[TransitionData]] = {
+    "file": LogTransitions,
+    "minari": LogTransitions,
+    "online": OnlineTransitions,
+}

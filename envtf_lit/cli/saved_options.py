@@ -17,6 +17,7 @@ from envtf_lit.pipeline.params import Params
 from envtf_lit.world_models.options import KINDS
 
 PART = re.compile(r"[A-Za-z_]\w*(\.\w+)*", re.ASCII)  # of a module, as it can be frozen
+ONLINE = "OnlineTransitions"  # under which Lightning keeps the state of the data module of that name
 SAVED = {"environment_transformer": "transformer", "ensemble_dynamics": "ensemble"}  # kinds, as folders name them
 
 
@@ -90,9 +91,21 @@ def checkpoint_class(path: str | Path, classes: Mapping[str, type]) -> str | Non
     return next((name for name, cls in classes.items() if {field.name for field in fields(cls)} == names), None)
 
 
+def learned_online(path: str | Path) -> bool:
+    """Whether a checkpoint holds an `OnlineData`'s state; of what is no checkpoint others tell."""
+    try:
+        return ONLINE in _checkpoint(path)
+    except Exception:  # whatever unpickling raises
+        return False
+
+
 def _hyper_parameters(path: str | Path) -> dict[str, Any]:
+    return _checkpoint(path)["hyper_parameters"]
+
+
+def _checkpoint(path: str | Path) -> dict[str, Any]:
     check_plain(path)
-    return torch.load(path, map_location="cpu", weights_only=True, mmap=True)["hyper_parameters"]  # no weights read
+    return torch.load(path, map_location="cpu", weights_only=True, mmap=True)  # no weights read
 
 
 def _config(folder: str | Path) -> tuple[str, Mapping[str, Any]]:

@@ -1,5 +1,6 @@
 """The grid: which runs there are to do, and in which order."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -105,8 +106,11 @@ def grid(
         seeds: None for the kit's own.
 
     Raises:
-        UserError: an unknown name, with the nearest known one.
+        UserError: an unknown name, with the nearest known one, or a seed that is named twice.
     """
+    twice = next((seed for seed, count in Counter(seeds or ()).items() if count > 1), None)
+    if twice is not None:
+        raise UserError(f"Seed {twice} is named twice, which is the same run: give further seeds, each once.")
     chosen = [(kit, KITS[known("kit", kit, KITS)]) for kit in dict.fromkeys(kits)]
     cells = [
         Cell(known("robot", robot, ROBOTS), known("tier", tier, TIERS), algorithm, kit, seed, budget)
@@ -114,7 +118,7 @@ def grid(
         for tier in dict.fromkeys(tiers)
         for kit, plan in chosen
         for algorithm in dict.fromkeys(algorithms or plan.algorithms)
-        for seed in dict.fromkeys(seeds or plan.seeds)
+        for seed in seeds or plan.seeds
         if known("algorithm", algorithm, ALGORITHMS)
     ]
     first = {kit: (seeds or plan.seeds)[0] for kit, plan in chosen}

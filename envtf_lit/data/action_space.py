@@ -23,6 +23,7 @@ PLACES = {
 TOLERANCE = 1e-5  # of half the action space, which is what rounding may add
 FILLED = 0.9  # of the way from 0 to a limit: actions that reach less far speak against that limit
 FEW = 32  # different whole numbers, of which a discrete action space may consist
+OTHER_METHOD = "if they number choices, take another method: here actions are continuous"
 STATE = (
     "state the robot's own: 'action_low' and 'action_high' in the file, as attributes or arrays, or "
     "`envtf data convert IN OUT --action-low LOW --action-high HIGH`"
@@ -130,4 +131,4 @@ def discrete(actions: Column) -> list[Finding]:
     if len(seen) < 2:
         return []
     what = f"all actions are whole numbers ({', '.join(f'{value:g}' for value in sorted(seen)[:8])})"
-    return [Finding("warning", what, "if they number choices, take another method: here actions are continuous")]
+    return [Finding("warning", what, OTHER_METHOD)]

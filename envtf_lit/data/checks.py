@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from envtf_lit.data.action_space import discrete, inside, read_limits
+from envtf_lit.data.action_space import OTHER_METHOD, discrete, inside, read_limits
 from envtf_lit.data.columns import Column, FileRows, column_blocks, take
 from envtf_lit.data.dataset import COLUMNS, OfflineDataset, starts_from_ends
 from envtf_lit.data.findings import Finding
@@ -138,7 +138,9 @@ def _misshapen(columns: Mapping[str, Any]) -> Iterator[Finding]:
     for name, values in columns.items():
         if len(values.shape) != RANKS[name]:
             want = "(N, dimensions)" if RANKS[name] == 2 else "(N,)"
-            yield Finding("error", f"{name!r} has shape {values.shape}", f"reshape it to {want}")
+            choices = name == "actions" and len(values.shape) == 1 and values.dtype.kind in "iu"
+            fix = f"{OTHER_METHOD}; else reshape them to {want}" if choices else f"reshape it to {want}"
+            yield Finding("error", f"{name!r} has shape {values.shape}", fix)
         elif 0 in values.shape:
             yield Finding("error", f"{name!r} has shape {values.shape}, which is empty", "collect some transitions")
         else:

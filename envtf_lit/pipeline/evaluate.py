@@ -57,7 +57,7 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
     with run_stage("evaluate", params, root):
         dataset, rollouts = load_dataset(dataset_of(params, root)), load_rollouts(rollouts_file(root, name))
         folder = root / WORLD_MODELS / name
-        model = load_world_model(folder)
+        model = load_world_model(folder, dataset=dataset)
         training, held_out = dataset.split()
         held_out = held_out.validation_and_test()[1]
         scale = Scale.of(training)

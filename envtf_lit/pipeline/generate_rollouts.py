@@ -65,8 +65,10 @@ def generate_rollouts(
 def _imagine(params: Params, root: Path, name: str) -> Rollouts:
     """The policy's rollouts in the world model; their rate goes to the side file."""
     options, device, folder = params.generate_rollouts, pick_device(), root / WORLD_MODELS / name
-    points = BranchPoints(load_dataset(dataset_of(params, root)), device)
-    model = as_observed(load_world_model(folder, fused=params.compile).to(device), robot_of(params))
+    dataset = load_dataset(dataset_of(params, root))
+    points = BranchPoints(dataset, device)
+    model = load_world_model(folder, fused=params.compile, dataset=dataset).to(device)
+    model = as_observed(model, robot_of(params))
     policy = load_policy(root / POLICIES / options.policy, guarded=False).to(device)
     generator = torch.Generator(device).manual_seed(params.seed)
     histories = points.draw_stretches(options.branches, options.history, STRETCH, generator)

@@ -144,7 +144,7 @@ def imagined_batches(params: Params, root: Path, options: Any, data: TransitionD
     """The source of imagined rows that a policy's options name."""
     device, folder = pick_device(), root / WORLD_MODELS / options.world_model
     imagination = Imagination(
-        as_observed(load_world_model(folder, fused=params.compile).to(device), robot_of(params)),
+        as_observed(load_world_model(folder, fused=params.compile, dataset=data.dataset).to(device), robot_of(params)),
         data.dataset,
         termination_rule(params.task, folder, device),
         options.rollouts,
