@@ -166,7 +166,7 @@ def test_how_episodes_begin_is_a_share_of_the_draws():
 
 def test_an_agent_may_ask_for_starts(tmp_path):
     dataset = make_dataset((300,) * 10, (False,) * 10)
-    save_dataset(replace(dataset, action_high=dataset.actions.max(0)), tmp_path / "log.h5")
+    save_dataset(replace(dataset, action_high=np.asarray(dataset.actions).max(0)), tmp_path / "log.h5")
     data = TransitionData(str(tmp_path / "log.h5"), return_temperature=0.5)
     before = data.weights
     data.start_share = 0.6

@@ -26,7 +26,8 @@ def folder(tmp_path: Path) -> Path:
 
 def moved(shift: float, scale: float, dimension: int = 3) -> OfflineDataset:
     """The log with one dimension of its states so many of its deviations away, or that much wider."""
-    mean, std = LOG.observations.mean(0)[dimension], LOG.observations.std(0)[dimension]
+    recorded = np.asarray(LOG.observations)[:, dimension]
+    mean, std = recorded.mean(), recorded.std()
     columns = {}
     for name in ("observations", "next_observations"):
         columns[name] = np.array(getattr(LOG, name))
