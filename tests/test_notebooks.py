@@ -6,10 +6,12 @@ from pathlib import Path
 import nbformat
 import papermill
 import pytest
+from made_up_comparison import some_run, write_comparison
 from ruamel.yaml import YAML
 from tutorials import NAMES, NOTEBOOKS, cells, outputs, solutions, with_solutions
 
 from envtf_lit.cli.main import main
+from envtf_lit.comparison.records import Run
 from envtf_lit.errors import UserError
 from envtf_lit.figures.notebook import execute
 from envtf_lit.project.tutorials import TINY, run_tutorial, tiny_parameters
@@ -113,3 +115,49 @@ def test_a_tutorial_is_run_by_its_name(tmp_path: Path, capsys: pytest.CaptureFix
         run_tutorial("01_small", folder, out=tmp_path, tiny=True)
     with pytest.raises(UserError, match="has no tutorials"):
         run_tutorial("01_small", tmp_path, out=tmp_path)
+
+
+# the one that reads results, whatever part of a grid they are
+
+
+def read_results(tmp_path: Path, runs: list[Run], kit: str) -> str:
+    """What is said by the tutorial on results, at its tiny size, of some runs."""
+    write_comparison(tmp_path / "results.csv", runs, {"ant-medium": (20.0, 60.0)})
+    name, given = "08_results", {"results": str(tmp_path / "results.csv"), "kit": kit, "folder": str(tmp_path / "work")}
+    parameters = tiny_parameters(name, NOTEBOOKS) | given | {"seeds": 1}
+    execute(with_solutions(name, tmp_path), tmp_path / "out.ipynb", parameters, folded=False)
+    found = outputs(tmp_path / "out.ipynb")
+    assert [output for output in found if output.get("name") == "stderr"] == []
+    said = "\n".join(output["data"].get("text/markdown", "") for output in found if "data" in output)
+    assert not re.search(r"\bnan\b|\binf\b|None", said)
+    return said
+
+
+def test_results_of_several_seeds_have_intervals_and_verdicts(tmp_path: Path) -> None:
+    levels = {"wbc": 30.0, "cql": 50.0, "et_cql": 70.0}
+    runs = [
+        some_run(task, name, level + 3 * seed, seed=seed)
+        for name, level in levels.items()
+        for task in ("hopper-medium", "ant-medium", "ant-random")
+        for seed in range(3)
+    ]
+    said = read_results(tmp_path, runs, "same")
+    assert "**27 runs** of Weighted BC, CQL, ET + CQL, on 3 of 20 tasks" in said
+    assert "393 of 420 planned runs are missing. Nothing at all is there of ReBRAC, IQL, COMBO, MOBILE." in said
+    assert "9 of 9 cells have an interval." in said and "ET + CQL is above CQL on 3 of 3 tasks." in said
+    assert "| +20.0 ± 0.0 over 3 tasks | **reproduces** |" in said and "1 of 5 reproduce, 0 do not, 4 are open" in said
+    assert "Those made above stand in" not in said
+
+
+def test_a_single_run_has_no_interval_and_leaves_all_open(tmp_path: Path) -> None:
+    said = read_results(tmp_path, [some_run("ant-medium", "et_cql_paper", 40.0, kit="published")], "published")
+    assert "on 1 of 20 tasks" in said and "No cell has an interval: each has one seed" in said
+    assert "There are no two algorithms with runs on a common task." in said
+    assert "0 of 5 reproduce, 0 do not, 5 are open" in said
+    assert "0 of 1 tasks" in said and "`envtf compare run --kits published --seeds 0 1 2`" in said
+
+
+def test_without_results_it_says_which_command_makes_them(tmp_path: Path) -> None:
+    said = read_results(tmp_path, [some_run("ant-medium", "cql", 40.0)], "published")
+    assert "No runs of the kit `published` yet: `envtf compare run --kits published` makes them." in said
+    assert "**2 runs** of CQL, Weighted BC, on 1 of 20 tasks: 30 updates" in said

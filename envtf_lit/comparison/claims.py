@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from envtf_lit.agents.options import NO_WORLD_MODEL
 from envtf_lit.comparison.findings import Standing, first_alone, model_of
 from envtf_lit.comparison.grid import KITS
 from envtf_lit.comparison.references import TASK_SETS
@@ -135,7 +136,7 @@ def _fastest(view: View, standings: Mapping[str, Standing], name: str) -> Claim:
     known = {
         other: standing.reached
         for other, standing in standings.items()
-        if standing.reached is not None and model_of(some[other]) is not None
+        if standing.reached is not None and model_of(some[other]) not in (None, NO_WORLD_MODEL)
     }
     if name not in known or len(known) < 2:
         return Claim(said, "–", "open", "no runs of a second algorithm with a world model")

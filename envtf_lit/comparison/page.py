@@ -120,9 +120,7 @@ def claims(found: Iterable[Claim]) -> str:
     """What the paper says, what these runs say of it, the verdict and its reason; the counts before it."""
     found = list(found)
     count = Counter(claim.verdict for claim in found)
-    line = (
-        f"Of {len(found)} claims {count['reproduces']} reproduce, {count['does not']} do not, {count['open']} are open."
-    )
+    line = f"{count['reproduces']} of {len(found)} reproduce, {count['does not']} do not, {count['open']} are open."
     rows = [[claim.said, claim.found, f"**{claim.verdict}**", claim.why] for claim in found]
     return f"{line}\n\n{markdown_table(['the paper', 'these runs', 'verdict', 'why'], rows)}"
 
