@@ -5,12 +5,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from analytic import linear_data, linear_world
 from PIL import Image
 
+from envtf_lit.evaluation.horizon import horizon_report
 from envtf_lit.evaluation.in_context import Doubt
 from envtf_lit.figures.in_context import bodies_apart, change_curves, doubt_curves
+from envtf_lit.figures.model import traces
 from envtf_lit.figures.pendulum import paths_in_worlds, swings, value_maps
 from envtf_lit.figures.plane import belief_maps, paths_on_plane
+from envtf_lit.world_models.forecast import Scale, whole_episodes
 
 ANGLE = np.linspace(-3.0, 3.0, 40)
 
@@ -81,3 +85,10 @@ def test_the_plane_shows_paths_block_and_beliefs(tmp_path: Path) -> None:
     beliefs = {"SAC": np.full((5, 5), 3.0), "CQL": np.linspace(-2, -1, 25).reshape(5, 5)}
     maps = belief_maps(beliefs, log[:3], tmp_path / "maps.png", title="Two")
     assert len(table(maps)) == 50
+
+
+def test_traces_show_the_reward_where_a_panel_is_free(tmp_path: Path) -> None:
+    log = linear_data((40, 50))
+    report = horizon_report(linear_world(error=0.05), whole_episodes(log, 2, seed=0), Scale.of(log))
+    path = traces(report, None, tmp_path / "traces.png")
+    assert list(dict.fromkeys(table(path)["quantity"])) == ["s[0]", "s[1]", "s[2]", "reward"]

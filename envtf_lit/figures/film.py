@@ -38,8 +38,10 @@ def film_strip(
             pictures = _pictures(artist, observations, steps)
             for axis, step in zip(row, steps, strict=True):
                 axis.set(xticks=[], yticks=[])
-                axis.imshow(pictures.get(step, np.full((SIZE, SIZE, 3), 255, np.uint8)))
-                if step not in pictures:
+                if step in pictures:
+                    axis.imshow(pictures[step])
+                else:
+                    axis.set(facecolor="white", aspect="equal", xlim=(0, 1), ylim=(0, 1))  # as large as a picture
                     axis.text(0.5, 0.5, "over", ha="center", va="center", transform=axis.transAxes, color="gray")
             row[0].set_ylabel(label)
         for axis, step in zip(axes[0], steps, strict=True):

@@ -91,17 +91,17 @@ def value_maps(
     """
     ends = min(values.min() for values in found.values()), max(values.max() for values in found.values())
     with drawing(path, (4.2 * len(found) + 0.8, 3.7), 1, len(found)) as (figure, axes):
-        images = []
         for axis, (name, values) in zip(axes[0], found.items(), strict=True):
             extent = (low[0], high[0], low[1], high[1])
-            colours = dict(vmin=ends[0], vmax=ends[1], cmap=WORTH)
-            images.append(axis.imshow(values.T, origin="lower", extent=extent, aspect="auto", **colours))
+            axis.imshow(
+                values.T, origin="lower", extent=extent, aspect="auto", vmin=ends[0], vmax=ends[1], cmap=WORTH
+            )
             axis.contour(values.T, levels=8, extent=extent, colors="white", linewidths=0.6, alpha=0.7)
             axis.set(title=name, xlabel="angle (rad), upright at 0")
             axis.xaxis.set_major_locator(MultipleLocator(1.0))
             axis.grid(visible=False)
         axes[0, 0].set_ylabel("rate (rad/s)")
-        figure.colorbar(images[-1], ax=axes, label="value (discounted return)", pad=0.01)
+        figure.colorbar(axes[0, 0].images[0], ax=axes, label="value (discounted return)", pad=0.01)
         figure.suptitle(title)
     write_table(path, pd.concat(pd.DataFrame({"world": name, "value": v.ravel()}) for name, v in found.items()))
     return Path(path)

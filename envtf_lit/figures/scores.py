@@ -74,9 +74,14 @@ def returns_histogram(returns: np.ndarray, lengths: np.ndarray, path: str | Path
             mean = values.mean()
             axis.axvline(mean, color="black", linestyle="--", linewidth=1.2, label=f"mean {mean:.0f}")
             axis.set(xlabel=f"episode {label}", ylabel="episodes")
-            axis.yaxis.set_major_locator(MaxNLocator(integer=True))
+            axis.yaxis.set_major_locator(_whole_ticks())
             axis.legend()
-        axes[0, 1].xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes[0, 1].xaxis.set_major_locator(_whole_ticks())
         figure.suptitle(f"The dataset's {len(returns):,} episodes")
     write_table(path, pd.DataFrame({"return": returns, "length": lengths}))
     return Path(path)
+
+
+def _whole_ticks() -> MaxNLocator:
+    """Ticks of what is counted."""
+    return MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10], min_n_ticks=1)

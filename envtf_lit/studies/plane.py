@@ -116,7 +116,7 @@ class Learned:
 
 
 class _Diary(Curves):
-    """Curves that hold the epoch that was stopped, too."""
+    """Curves that outlive a training that is stopped; a type of its own, by which Lightning tells callbacks apart."""
 
 
 def learn(algorithm: str, dataset: Path, *, seed: int, **options: Any) -> Learned:
