@@ -1,8 +1,8 @@
 """What learning online adds to a policy of a log, on Hopper: `python benchmarks/online.py [--out OUT.json]`.
 
-Conservative Q-learning learns from `hopper-medium-replay`, which has seed 0; its policy then learns on online, once for
-each seed, by `envtf agent fit` as a user's would. Scores are of the same 20 episodes before and after. What lies in the
-work folder is used again.
+An algorithm learns from the log of a project where `make repro` has run, and its policy learns on in the simulator,
+once for each seed; both by `envtf agent fit`, as a user's would. A run's scores are of the same episodes before and
+after. Runs that lie in the work folder are used again.
 """
 
 import argparse
@@ -15,14 +15,10 @@ from typing import Any
 
 import pandas as pd
 
-from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.files import write_json
-from envtf_lit.robots.tasks import get_task
 from envtf_lit.studies.machine import facts
 from envtf_lit.training import pick_device
-from envtf_lit.zoo.collect import collect
 
-TASK, EPISODES = "hopper-medium-replay", 20
 QUIET = ["--trainer.logger=false", "--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
 
 
@@ -30,53 +26,48 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, metavar="FILE", help="JSON")
     parser.add_argument("--work", type=Path, default=Path(".envtf/online"), metavar="DIR")
+    parser.add_argument("--project", type=Path, default=Path(), metavar="DIR", help="where `make repro` has run")
+    parser.add_argument("--algorithm", default="iql", help="that it learns by, on the log and online")
+    parser.add_argument("--offline-updates", type=int, default=1_500, help="on the log, once for all seeds")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--rows", type=int, default=100_000, help="of the log")
-    parser.add_argument("--offline-updates", type=int, default=4_500)
-    parser.add_argument("--env-steps", type=int, default=20_000, help="of each run, an update for each")
-    parser.add_argument("--every", type=int, default=2_500, help="updates between two looks at the policy")
+    parser.add_argument("--warm-start", type=int, default=1_000, help="updates of the critics alone, on the log")
+    parser.add_argument("--env-steps", type=int, default=3_000, help="an update for each, after the first thousand")
+    parser.add_argument("--every", type=int, default=1_000, help="updates between two looks at the policy")
+    parser.add_argument("--episodes", type=int, default=10, help="of each look")
     given = parser.parse_args()
-    result = vars(given) | {"runs": measure(given)} | facts(pick_device(), "fp32")
-    result = {name: value for name, value in result.items() if name not in ("out", "work")}
+    runs = {seed: learn(given, seed) for seed in given.seeds}
+    options = {name: value for name, value in vars(given).items() if name not in ("out", "work", "project", "seeds")}
+    result = options | {"runs": runs} | facts(pick_device(), "fp32")
     if given.out is not None:
         write_json(given.out, result)
     sys.stdout.write(json.dumps(result, indent=2) + "\n")
 
 
-def measure(given: argparse.Namespace) -> dict[int, dict[str, Any]]:
-    """By seed: the scores before the first step and after the last one, and the whole curve."""
-    log = given.work / f"{TASK}-{given.rows}.h5"
-    if not log.exists():
-        save_dataset(collect(get_task(TASK), given.rows, seed=0, workers=1).with_split(0.1, 0), log)
-    start = given.work / f"cql-{given.offline_updates}"
-    flags = [f"--model.options.{name}={given.offline_updates}" for name in ("updates", "updates_per_epoch")]
-    fit(start, log, "--model.algorithm=cql", *flags)
-    found = dict[int, dict[str, Any]]()
-    for seed in given.seeds:
-        run = given.work / f"sac-{given.env_steps}-{seed}"
-        curves = fit(
-            run,
-            log,
-            "--config=online",
-            f"--model.init_from={start / 'published'}",
-            f"--model.seed={seed}",
-            f"--seed_everything={seed}",
-            f"--model.options.updates={5_000 + given.env_steps}",  # the warm start's come first
-            f"--model.options.updates_per_epoch={given.every}",
-            f"--data.evaluation_episodes={EPISODES}",
-        )
-        steps, scores = curves["train/env_steps"].fillna(0), curves["val/score"]
-        curve = [[int(step), float(score)] for step, score in zip(steps, scores, strict=True)]
-        found[seed] = {"before": curve[0][1], "after": curve[-1][1], "curve": curve}
-    return found
+def learn(given: argparse.Namespace, seed: int) -> dict[str, Any]:
+    """Scores of one run: before the first step, after the last one, and by steps all along."""
+    offline = given.work / f"{given.algorithm}-{given.offline_updates}"
+    fit(given, offline, {"updates": given.offline_updates, "updates_per_epoch": given.offline_updates})
+    run = given.work / f"{offline.name}-online-{given.warm_start}-{given.env_steps}-{seed}"
+    updates = given.warm_start + given.env_steps
+    options = {"warm_start": given.warm_start, "updates": updates, "updates_per_epoch": given.every}
+    start = {"config": "online", "model.init_from": offline / "published", "model.seed": seed}
+    curves = fit(given, run, options, start | {"data.evaluation_episodes": given.episodes})
+    steps, scores = curves["train/env_steps"].fillna(0), curves["val/score"]
+    curve = [[int(step), round(float(score), 2)] for step, score in zip(steps, scores, strict=True)]
+    return {"before": curve[0][1], "after": curve[-1][1], "curve": curve}
 
 
-def fit(run: Path, log: Path, *flags: str) -> pd.DataFrame:
+def fit(
+    given: argparse.Namespace, run: Path, options: dict[str, int], first: dict[str, Any] | None = None
+) -> pd.DataFrame:
     """The curves of a policy that is published in `run`, and is trained unless it is there."""
     if not (run / "published").exists():
         shutil.rmtree(run, ignore_errors=True)  # of a call that was interrupted
-        command = [sys.executable, "-m", "envtf_lit", "agent", "fit", *flags, *QUIET]
-        subprocess.run([*command, f"--data.path={log}", f"--trainer.default_root_dir={run}"], check=True)
+        flags = (first or {}) | {"data.path": given.project / "data/dataset.h5", "model.algorithm": given.algorithm}
+        flags |= {f"model.options.{name}": value for name, value in options.items()}
+        flags |= {"trainer.default_root_dir": run}
+        command = [sys.executable, "-m", "envtf_lit", "agent", "fit", *QUIET]
+        subprocess.run([*command, *(f"--{name}={value}" for name, value in flags.items())], check=True)
     return pd.read_csv(run / "published/curves.csv")
 
 

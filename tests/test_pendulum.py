@@ -29,11 +29,11 @@ def test_soft_actor_critic_solves_the_pendulum_within_eight_thousand_steps(
     assert returns[0] < -900 and returns[steps <= 8_000][-1] >= -200 and expert >= -200
 
 
-@pytest.mark.parametrize("algorithm", list(OFFLINE))
+@pytest.mark.parametrize("algorithm", [name for name in OFFLINE if name != "bc"])
 def test_an_agent_reaches_nine_tenths_of_the_expert_from_its_log_alone(
     algorithm: str, learned: Learned, tmp_path: Path
 ) -> None:
-    """Of the way from random actions' return to the expert's."""
+    """Of the way from random actions' return to the expert's; cloning what the learner did all along does not."""
     _, expert, log = learned
     random = random_return()
     assert (learn_offline(algorithm, log, tmp_path, seed=0) - random) / (expert - random) >= 0.9
