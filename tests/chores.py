@@ -4,7 +4,9 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
+from envtf_lit.comparison.jobs import Job
 from envtf_lit.errors import UserError
 
 
@@ -30,3 +32,9 @@ def complain(folder: Path) -> None:
 def stumble(folder: Path) -> None:
     """Fails by a fault of its own."""
     raise ZeroDivisionError("by nought")
+
+
+def job(folder: Path, name: str, function: Any = sleep_and_note, *given: Any, after: tuple[str, ...] = ()) -> Job:
+    """One of these chores as a job, with a log of its own."""
+    arguments = given if function is sleep_and_note else (folder,)
+    return Job(name, "any", function, arguments, folder / f"{name}.log", after)

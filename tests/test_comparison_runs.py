@@ -1,6 +1,5 @@
 """Runs of the comparison for real, on a budget of seconds: in this process, in processes of their own, and on Ray."""
 
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -19,7 +18,7 @@ from envtf_lit.comparison.budgets import budget_of
 from envtf_lit.comparison.cell import evaluation_seed, run_cell, section_of
 from envtf_lit.comparison.cluster import run_on_ray
 from envtf_lit.comparison.grid import Cell, grid
-from envtf_lit.comparison.jobs import Job, Outcome, attempt, run_jobs
+from envtf_lit.comparison.jobs import Job, Outcome, attempt
 from envtf_lit.comparison.records import CURVES, DATASET, SHARED, Evaluation, Run, Shared, read_records
 from envtf_lit.comparison.runner import run_grid
 from envtf_lit.comparison.shared import Home
@@ -28,7 +27,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.policy import load_policy
 from envtf_lit.robots.returns import evaluate_policy
 from envtf_lit.robots.tasks import ROBOTS
-from tests.chores import complain, end_itself, sleep_and_note, stumble
+from tests.chores import complain, end_itself, job, sleep_and_note
 
 TINY = budget_of("cpu-small", updates=30, episodes=1, transitions=2_000, model_updates=10)
 FLAGS = ["--updates", "30", "--episodes", "1", "--transitions", "2000", "--model-updates", "10"]
@@ -49,11 +48,11 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def in_this_process(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Outcome]]:
     """What `run_jobs` does, without the seconds that each process takes to begin."""
     done = dict[str, bool]()
-    for job in jobs:
-        assert all(name in done for name in job.after)
-        outcome = attempt(job) if all(done[name] for name in job.after) else Outcome(error="waited in vain")
-        done[job.name] = outcome.error is None
-        yield job, outcome
+    for asked in jobs:
+        assert all(name in done for name in asked.after)
+        outcome = attempt(asked) if all(done[name] for name in asked.after) else Outcome(error="waited in vain")
+        done[asked.name] = outcome.error is None
+        yield asked, outcome
 
 
 @pytest.fixture
@@ -213,58 +212,7 @@ def test_nothing_is_begun_over_a_damaged_file_or_with_settings_that_contradict(w
     assert section_of(cell) == "same-et_cql-0-cpu-small-updates-10-transitions-2000"
 
 
-# processes
-
-
-def job(folder: Path, name: str, function: Any = sleep_and_note, *given: Any, after: tuple[str, ...] = ()) -> Job:
-    arguments = given if function is sleep_and_note else (folder,)
-    return Job(name, "any", function, arguments, folder / f"{name}.log", after)
-
-
-def test_jobs_wait_for_what_they_need_and_each_has_its_process(tmp_path: Path) -> None:
-    jobs = [
-        job(tmp_path, "a", sleep_and_note, tmp_path, "a", 0.2),
-        job(tmp_path, "b", sleep_and_note, tmp_path, "b", 0.0, after=("a",)),
-        job(tmp_path, "c", sleep_and_note, tmp_path, "c", 0.0),
-    ]
-    done = {of.name: outcome for of, outcome in run_jobs(jobs, 2)}
-    assert done.keys() == {"a", "b", "c"} and all(outcome.error is None for outcome in done.values())
-    assert len({outcome.value for outcome in done.values()} | {os.getpid()}) == 4
-    assert float((tmp_path / "b").read_text().split()[0]) >= float((tmp_path / "a").read_text().split()[1])
-    assert done["a"].seconds >= 0.2
-
-
-def test_a_job_that_fails_takes_those_along_that_need_it_and_no_others(tmp_path: Path) -> None:
-    jobs = [
-        job(tmp_path, "lost", end_itself),
-        job(tmp_path, "needs it", sleep_and_note, tmp_path, "x", 0.0, after=("lost",)),
-        job(tmp_path, "needs that", sleep_and_note, tmp_path, "x", 0.0, after=("needs it",)),
-        job(tmp_path, "refused", complain),
-        job(tmp_path, "faulty", stumble),
-        job(tmp_path, "fine", sleep_and_note, tmp_path, "fine", 0.0),
-    ]
-    errors = {of.name: outcome.error for of, outcome in run_jobs(jobs, 1)}
-    assert errors["lost"] == "its process was ended by signal 9; free some memory, or use fewer workers"
-    assert errors["needs it"] == "lost failed, which it needs"
-    assert errors["needs that"] == "needs it failed, which it needs"
-    assert errors["refused"] == "This was asked for."
-    assert errors["faulty"] == f"ZeroDivisionError: by nought (see {tmp_path / 'faulty.log'})"
-    assert errors["fine"] is None
-    assert (tmp_path / "refused.log").read_text() == "on the way\n"
-    assert "in stumble" in (tmp_path / "faulty.log").read_text()
-    assert not (tmp_path / "x").exists()
-
-
-def test_whoever_stops_listening_ends_the_processes(tmp_path: Path) -> None:
-    jobs = [
-        job(tmp_path, "a", sleep_and_note, tmp_path, "a", 0.0),
-        job(tmp_path, "b", sleep_and_note, tmp_path, "b", 60.0),
-    ]
-    running = run_jobs(jobs, 2)
-    assert next(running)[0].name == "a"
-    running.close()
-    assert multiprocessing.active_children() == []
-    assert not (tmp_path / "b").exists()
+# commands
 
 
 def compare(results: Path, work: Path, *more: str) -> list[str]:

@@ -97,7 +97,7 @@ def test_a_film_has_no_picture_of_what_is_over_or_not_finite(tmp_path: Path, mon
         film.film_strip(strips, HOPPER, [0, 4, 9], tmp_path / "f.png", title="three")
     shown = [len(axis.images) for axis in figures[0].axes]
     assert shown == [1, 1, 1, 1, 1, 0, 1, 1, 0]
-    assert len({tuple(axis.get_window_extent().size.round()) for axis in figures[0].axes}) == 1
+    assert len({tuple(map(round, axis.get_window_extent().size)) for axis in figures[0].axes}) == 1
     assert film.spread_steps(9, 3) == [0, 4, 9] and film.spread_steps(1) == [0, 1]
 
 
