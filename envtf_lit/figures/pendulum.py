@@ -93,9 +93,7 @@ def value_maps(
     with drawing(path, (4.2 * len(found) + 0.8, 3.7), 1, len(found)) as (figure, axes):
         for axis, (name, values) in zip(axes[0], found.items(), strict=True):
             extent = (low[0], high[0], low[1], high[1])
-            axis.imshow(
-                values.T, origin="lower", extent=extent, aspect="auto", vmin=ends[0], vmax=ends[1], cmap=WORTH
-            )
+            axis.imshow(values.T, origin="lower", extent=extent, aspect="auto", vmin=ends[0], vmax=ends[1], cmap=WORTH)
             axis.contour(values.T, levels=8, extent=extent, colors="white", linewidths=0.6, alpha=0.7)
             axis.set(title=name, xlabel="angle (rad), upright at 0")
             axis.xaxis.set_major_locator(MultipleLocator(1.0))
