@@ -13,7 +13,7 @@ from made_up_runs import made_up_run, some_estimates, some_frontier
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from envtf_lit.agents.levels import LEVELS
+from envtf_lit.agents.trust_levels import LEVELS
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.metrics import held_out_metrics
 from envtf_lit.evaluation.promises import Places, Range, kept, promised_range, read_frontier

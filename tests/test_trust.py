@@ -13,8 +13,8 @@ from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.agents import trust as trust_module
 from envtf_lit.agents.et_cql import ETCQL, ETCQLOptions, GuardedRolloutOptions
 from envtf_lit.agents.frontier import Frontier
-from envtf_lit.agents.levels import LEAST_GAIN, LEVELS
 from envtf_lit.agents.trust import Trust
+from envtf_lit.agents.trust_levels import LEAST_GAIN, LEVELS
 from envtf_lit.agents.value_gradient import ImaginedPaths, ValueGradientOptions
 from envtf_lit.critics import StackedCritics
 from envtf_lit.data.loaders import DrawnRows

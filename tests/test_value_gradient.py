@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from envtf_lit.agents import value_gradient
 from envtf_lit.agents.et_cql import ETCQL, GuardedRolloutOptions
-from envtf_lit.agents.levels import LEVELS, Level
 from envtf_lit.agents.scales import LogReturns
+from envtf_lit.agents.trust_levels import LEVELS, Level
 from envtf_lit.agents.value_gradient import (
     BETAS,
     ImaginedPaths,

@@ -11,10 +11,10 @@ from envtf_lit.agents.actor_critic import ActorCritic
 from envtf_lit.agents.combo import COMBO, ImaginingOptions, MixingOptions
 from envtf_lit.agents.cql import CQL, ConservativeOptions
 from envtf_lit.agents.frontier import Frontier
-from envtf_lit.agents.levels import CLONE, FRONTIER, LEVELS, TrustLevel
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.phases import Batch, Logs, Losses, Part, Phase
 from envtf_lit.agents.trust import Trust, WatchedWarmStart
+from envtf_lit.agents.trust_levels import CLONE, FRONTIER, LEVELS, TrustLevel
 from envtf_lit.agents.value_gradient import BETAS, PLACES, ValueGradient, ValueGradientOptions
 from envtf_lit.critics import Critics
 from envtf_lit.data.datamodules import TransitionData
@@ -69,7 +69,7 @@ class ETCQLOptions(MixingOptions, ConservativeOptions):
 
     Attributes:
         trust: how far the policy may leave what the log supports: `cautious`, `default`, or `bold`, which is for those
-            who can try it in a simulator (`levels.LEVELS`).
+            who can try it in a simulator (`trust_levels.LEVELS`).
         critic_updates: before the value gradient, in which critics learn the clone's value on real rows and on those of
             `generate_rollouts`. All updates before are the warm start, whatever the common `warm_start` says.
         value_gradient: the end of the training, in which the actor follows the gradient through the world model.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from envtf_lit.actors import Actor
-from envtf_lit.agents.levels import COLUMNS, LEAST_GAIN
+from envtf_lit.agents.trust_levels import COLUMNS, LEAST_GAIN
 from envtf_lit.critics import StackedCritics
 from envtf_lit.imagination.promise import Promise
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from envtf_lit.actors import Actor, TanhGaussianActor
 from envtf_lit.agents.actor_critic import held_fixed
 from envtf_lit.agents.agent import Agent
-from envtf_lit.agents.levels import Level
 from envtf_lit.agents.phases import Batch, Logs, Phase, follow
+from envtf_lit.agents.trust_levels import Level
 from envtf_lit.imagination.buffer import Imagination
 from envtf_lit.imagination.histories import Histories
 from envtf_lit.imagination.promise import promised

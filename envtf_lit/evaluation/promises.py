@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from envtf_lit.agents.levels import COLUMNS, FRONTIER
+from envtf_lit.agents.trust_levels import COLUMNS, FRONTIER
 from envtf_lit.errors import UserError
 from envtf_lit.files import check_plain
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.axes import Axes
 
-from envtf_lit.agents.levels import CLONE, LEVELS
+from envtf_lit.agents.trust_levels import CLONE, LEVELS
 from envtf_lit.evaluation.promises import ERRORS, Places, kept, promised_range
 from envtf_lit.figures.style import COLOURS, drawing, policy_colours, write_table
 

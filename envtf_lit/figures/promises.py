@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from envtf_lit.agents.levels import CLONE, LEAST_GAIN, LEVELS
+from envtf_lit.agents.trust_levels import CLONE, LEAST_GAIN, LEVELS
 from envtf_lit.evaluation.promises import Range, kept, promised_range
 from envtf_lit.figures.report import Run
 

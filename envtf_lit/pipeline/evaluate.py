@@ -6,9 +6,9 @@ from typing import Any
 
 import pandas as pd
 
-from envtf_lit.agents.levels import CLONE
 from envtf_lit.agents.options import NO_WORLD_MODEL
 from envtf_lit.agents.registry import ALGORITHMS
+from envtf_lit.agents.trust_levels import CLONE
 from envtf_lit.data.sources.files import load_dataset
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.horizon import horizon_report

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from envtf_lit.agents.et_cql import ETCQLOptions
-from envtf_lit.agents.levels import CLONE, TrustLevel
+from envtf_lit.agents.trust_levels import CLONE, TrustLevel
 from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.errors import UserError
