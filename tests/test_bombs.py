@@ -16,6 +16,7 @@ import torch
 from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.cli.saved_options import checkpoint_options, model_architecture
 from envtf_lit.data.sources.files import load_dataset
+from envtf_lit.data.sources.minari import read_minari, write_minari
 from envtf_lit.errors import UserError
 from envtf_lit.files import read_json, write_json
 from envtf_lit.imagination.rollouts import Rollouts
@@ -28,6 +29,7 @@ from envtf_lit.robots.tasks import get_task
 from envtf_lit.training import _checkpoint, run_folder
 from envtf_lit.world_models.options import TransformerOptions
 from envtf_lit.zoo.snapshots import read_series
+from tests.walker import walker_dataset
 
 SECONDS, MEGABYTES = 2.0, 500
 LAUGH = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
@@ -180,6 +182,37 @@ def test_a_checkpoint_that_is_a_compressed_archive(tmp_path: Path) -> None:
         for name in sound.namelist():
             bomb.writestr(name, bytes(10**8) if name.endswith("/data/0") else sound.read(name))
     assert "is not a checkpoint" in refused(READERS["checkpoint"], tmp_path / "bomb.ckpt")
+
+
+def minari_log(path: Path) -> Path:
+    """The folder of a sound Minari dataset of four episodes."""
+    write_minari(walker_dataset(episodes=4), "my/log-v0", root=path)
+    return path / "my/log-v0/data"
+
+
+@pytest.mark.parametrize("told", [10**9, 10**30, -1, 5, 4.0, "4", True, None])
+def test_a_minari_dataset_that_tells_of_more_episodes_than_it_holds(told: Any, tmp_path: Path) -> None:
+    folder = minari_log(tmp_path)
+    assert len(read_minari(folder).episode_starts) == 4
+    metadata = read_json(folder / "metadata.json")
+    write_json(folder / "metadata.json", metadata | {"total_episodes": told})
+    assert "episodes and holds 4" in refused(read_minari, folder)
+
+
+@pytest.mark.parametrize("kind", ["circle", "doubling", "same array"])
+def test_a_minari_dataset_whose_links_never_end(kind: str, tmp_path: Path) -> None:
+    folder = minari_log(tmp_path)
+    with h5py.File(folder / "main_data.hdf5", "r+") as file:
+        episode: Any = file["episode_0"]
+        if kind == "circle":
+            episode["again"] = file["/"]
+        elif kind == "same array":
+            episode["again"] = file["episode_1/rewards"]
+        for depth in range(40 if kind == "doubling" else 0):
+            following = episode.create_group(f"left{depth}")
+            episode[f"right{depth}"] = following
+            episode = following
+    assert "leads elsewhere" in refused(read_minari, folder)
 
 
 # side files and tables of another form

@@ -221,29 +221,43 @@ def _open(folder: Path, source: str) -> "MinariDataset":
         raise UserError(f"{source} does not say its spaces: write it anew with Minari 0.5 or newer.")
     if metadata.get("data_format") == "hdf5":
         _check_file(folder / HDF5_FILE, source)
+    _check_count(folder, metadata.get("total_episodes"), source)
     return MinariDataset(folder)
 
 
 def _check_file(path: Path, source: str) -> None:
-    """Nothing that leads to another file, and no sizes that the file cannot hold."""
-    declared = {}
+    """Nothing that leads to another file or to the same place again, and no sizes that the file cannot hold."""
+    declared, seen = {}, set[Any]()
 
     def visit(group: h5py.Group) -> None:
         for name in map(str, group):
             item = own_hdf5(group, name)
-            if item is None:
+            if item is None or item in seen:
                 where = f"{group.name}/{name}".replace("//", "/")
                 raise UserError(
                     f"{source} holds under {where} what leads elsewhere: store plain arrays, without links."
                 )
+            seen.add(item)
             if isinstance(item, h5py.Group):
                 visit(item)
             else:
                 declared[f"{group.name}/{name}"] = hdf5_bytes(item)
 
     with h5py.File(path, "r") as file:
+        seen.add(file["/"])
         visit(file)
     check_size(path, declared)
+
+
+def _check_count(folder: Path, told: Any, source: str) -> None:
+    """Minari lays out as many episodes as the metadata say, before it looks for them."""
+    if (folder / HDF5_FILE).exists():
+        with h5py.File(folder / HDF5_FILE, "r") as file:
+            there = len(file)
+    else:
+        there = sum(1 for entry in folder.iterdir() if entry.is_dir())
+    if type(told) is not int or not 0 <= told <= there:
+        raise UserError(f"{source} says that it has {told!s:.40} episodes and holds {there}: fetch or write it anew.")
 
 
 def _check_spaces(dataset: "MinariDataset", source: str) -> None:
