@@ -21,6 +21,7 @@ exclude_patterns = ["README.md"]  # GitHub's front page of this folder, which in
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 nb_execution_mode = "off"
+nb_render_markdown_format = "myst"  # CommonMark, which is the default, has no tables
 suppress_warnings = ["etoc.glob"]  # of tutorials, where none was executed
 
 default_role = "code"  # docstrings put code in single backticks
