@@ -119,7 +119,9 @@ def test_bad_content_is_named_with_its_fix(case: str):
     assert not any("\n" in text for text in found)
 
 
-@pytest.mark.parametrize("case", ["short", "rank 1", "choices", "rank 2", "scalar", "narrow", "no dimensions", "zero rows"])
+@pytest.mark.parametrize(
+    "case", ["short", "rank 1", "choices", "rank 2", "scalar", "narrow", "no dimensions", "zero rows"]
+)
 def test_one_misshapen_column_is_one_error(case: str):
     content = columns()
     BAD[case][0](content)
