@@ -84,6 +84,7 @@ def mean_return(policy: Policy, seed: int = 0) -> float:
 def random_return() -> float:
     """Of uniform actions."""
     limit = torch.tensor([2.0])
+    torch.manual_seed(0)
     return mean_return(RandomPolicy(-limit, limit))
 
 
