@@ -4,9 +4,11 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, ClassVar, TypedDict, Unpack, cast
+from typing import Any, ClassVar, TypedDict, Unpack, cast, overload
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -133,9 +135,48 @@ class Actor(nn.Module, ABC):
             x = layer(x)
         return in_fp32(last, x)
 
+    @overload
+    def act(
+        self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None
+    ) -> Tensor: ...
+
+    @overload
+    def act(
+        self, observation: ArrayLike, deterministic: bool = True, generator: torch.Generator | None = None
+    ) -> np.ndarray: ...
+
+    def act(
+        self, observation: Tensor | ArrayLike, deterministic: bool = True, generator: torch.Generator | None = None
+    ) -> Tensor | np.ndarray:
+        """Observations (B, S) to actions (B, A), or one (S,) to one (A,), in the environment's own range.
+
+        A tensor gives a tensor of its precision, without gradient; an array or a list of numbers an array (float32).
+
+        Args:
+            observation: what is seen.
+            deterministic: the action that the actor would choose, not one that it draws.
+            generator: of what is drawn.
+
+        Raises:
+            UserError: an array is not as wide as the actor's observations.
+        """
+        with torch.no_grad():
+            if isinstance(observation, Tensor):
+                if observation.dtype == torch.float64:  # as simulators have it
+                    return self._act(observation.float(), deterministic, generator).double()
+                return self._act(observation, deterministic, generator)
+            array = np.asarray(observation, np.float32)
+            width = len(self.observation_mean)
+            if array.ndim == 0 or array.shape[-1] != width:
+                raise UserError(
+                    f"The policy takes observations of {width} numbers: these have the shape {array.shape}."
+                )
+            rows = torch.as_tensor(array, device=self.observation_mean.device)
+            return self._act(rows, deterministic, generator).cpu().numpy()
+
     @abstractmethod
-    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
-        """As of `Policy`, without gradient."""
+    def _act(self, observation: Tensor, deterministic: bool, generator: torch.Generator | None) -> Tensor:
+        """Observations (..., S) to actions (..., A)."""
 
     @abstractmethod
     def clone_error(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -165,13 +206,12 @@ class TanhGaussianActor(Actor):
         mean, log_std = self.outputs(observation).chunk(2, dim=-1)
         return mean, log_std.clamp(self.log_std_min, LOG_STD_MAX)
 
-    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
-        """Observations (B, S) to actions (B, A): tanh of the mean, or of a sample drawn with `generator`."""
-        with torch.no_grad():
-            mean, log_std = self(observation)
-            if not deterministic:
-                mean = mean + log_std.exp() * _normal(mean, generator)
-            return self._scale(torch.tanh(mean))
+    def _act(self, observation: Tensor, deterministic: bool, generator: torch.Generator | None) -> Tensor:
+        """Tanh of the mean, or of a draw."""
+        mean, log_std = self(observation)
+        if not deterministic:
+            mean = mean + log_std.exp() * _normal(mean, generator)
+        return self._scale(torch.tanh(mean))
 
     def sample(
         self, observation: Tensor, count: int | None = None, *, generator: torch.Generator | None = None
@@ -243,13 +283,12 @@ class GaussianActor(Actor):
         """Observation (..., S) to the mean (..., A) and log standard deviation (A,), in shares of the range."""
         return torch.tanh(self.outputs(observation)), self.log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
 
-    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
-        """Observations (B, S) to actions (B, A): the mean, or a sample drawn with `generator`, cut at the limits."""
-        with torch.no_grad():
-            mean, log_std = self(observation)
-            if not deterministic:
-                mean = (mean + log_std.exp() * _normal(mean, generator)).clamp(-1.0, 1.0)
-            return self._scale(mean)
+    def _act(self, observation: Tensor, deterministic: bool, generator: torch.Generator | None) -> Tensor:
+        """The mean, or a draw, cut at the limits."""
+        mean, log_std = self(observation)
+        if not deterministic:
+            mean = (mean + log_std.exp() * _normal(mean, generator)).clamp(-1.0, 1.0)
+        return self._scale(mean)
 
     def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
         """Log-density of given actions: observation (B, S), action (B, A) to (B,), per unit of shares of the range."""
@@ -269,10 +308,9 @@ class DeterministicActor(Actor):
         """Observations (..., S) to actions (..., A) in the environment's own range."""
         return self._scale(torch.tanh(self.outputs(observation)))
 
-    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
-        """Observations (B, S) to actions (B, A); `deterministic` changes nothing: there is nothing to draw."""
-        with torch.no_grad():
-            return self(observation)
+    def _act(self, observation: Tensor, deterministic: bool, generator: torch.Generator | None) -> Tensor:
+        """`deterministic` changes nothing: there is nothing to draw."""
+        return self(observation)
 
     def clone_error(self, observation: Tensor, action: Tensor) -> Tensor:
         """(B,) squared distance in shares of the range, mean over action dimensions."""

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -131,3 +132,35 @@ def test_least_squares_are_the_log_of_the_mean_action_s_error():
     assert all(bool(g.isfinite().all()) for g in gradient) and any(float(g.abs().sum()) > 0 for g in gradient)
     exact = actor.least_squares(observation, actor.act(observation))
     assert exact.item() == pytest.approx(math.log(1e-3), abs=1e-3)  # no finer than this is asked for
+
+
+@KINDS
+def test_what_is_given_comes_back_in_kind(cls: type[Actor]) -> None:
+    """A tensor or an array, of either precision, one row or many."""
+    actor = make_actor(cls, **LIMITS)
+    rows = torch.randn(B, S)
+    actions = actor.act(rows)
+    assert actions.shape == (B, A) and actions.dtype == torch.float32 and not actions.requires_grad
+    torch.testing.assert_close(actor.act(rows[0]), actions[0])
+    torch.testing.assert_close(actor.act(rows.double()), actions.double())
+    for given in (rows.numpy(), rows.double().numpy(), rows.tolist()):
+        found = actor.act(given)
+        assert isinstance(found, np.ndarray) and found.dtype == np.float32
+        np.testing.assert_array_equal(found, actions.numpy())
+        np.testing.assert_allclose(actor.act(given[0]), actions[0].numpy(), rtol=1e-5, atol=1e-6)
+    drawn = [
+        actor.act(x, deterministic=False, generator=torch.Generator().manual_seed(1)) for x in (rows, rows.numpy())
+    ]
+    np.testing.assert_array_equal(drawn[0].numpy(), drawn[1])
+
+
+@KINDS
+@pytest.mark.parametrize("shape", [(S + 1,), (B, S - 1), ()])
+def test_observations_of_another_width_are_said(cls: type[Actor], shape: tuple[int, ...], tmp_path: Path) -> None:
+    save_policy(tmp_path, make_actor(cls))
+    policy = load_policy(tmp_path)
+    for given in (np.zeros(shape), torch.zeros(shape)):
+        with pytest.raises(UserError, match=rf"takes observations of {S} numbers: these have the shape \("):
+            policy.act(given)
+    with pytest.raises(UserError, match="dimension 1 of the observation is nan"):
+        policy.act([0.0, math.nan, 0.0])

@@ -1,5 +1,7 @@
 """OfflineDataset against hand-computed cases."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from analytic import linear_data
@@ -93,3 +95,9 @@ def test_held_out_episodes_are_for_validation_or_for_testing() -> None:
     assert validation.episode_lengths.tolist() == [5, 7] and test.episode_lengths.tolist() == [4, 6, 8]
     for lone in data.select([3]).validation_and_test():
         assert lone.episode_lengths.tolist() == [7]
+
+
+def test_a_dataset_is_printed_in_a_line() -> None:
+    dataset = make([1_000, 200])
+    assert repr(dataset) == "<OfflineDataset 1,200 steps in 2 episodes, observations of 2, actions of 1>"
+    assert repr(replace(dataset, task="hopper-medium")).startswith("<OfflineDataset hopper-medium: 1,200 steps")

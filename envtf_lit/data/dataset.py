@@ -15,7 +15,7 @@ from envtf_lit.errors import UserError
 COLUMNS = ("observations", "actions", "rewards", "next_observations", "terminated", "truncated")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class OfflineDataset:
     """N transitions `(s, a, r, s')` with S observation and A action dimensions, stored episode after episode.
 
@@ -46,6 +46,11 @@ class OfflineDataset:
     action_high: np.ndarray
     task: str | None = field(default=None)
     held_out: np.ndarray | None = field(default=None)
+
+    def __repr__(self) -> str:
+        task = "" if self.task is None else f"{self.task}: "
+        sizes = f"observations of {self.observation_dim}, actions of {self.action_dim}"
+        return f"<OfflineDataset {task}{len(self):,} steps in {len(self.episode_starts):,} episodes, {sizes}>"
 
     def __len__(self) -> int:
         return len(self.rewards)
