@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("--env-steps", type=int, default=3_000, help="an update for each, after the first thousand")
     parser.add_argument("--every", type=int, default=1_000, help="updates between two looks at the policy")
     parser.add_argument("--episodes", type=int, default=10, help="of each look")
+    parser.add_argument("--as-on-the-log", action="store_true", help="with the options of the log, not of online.yaml")
     given = parser.parse_args()
     runs = {seed: learn(given, seed) for seed in given.seeds}
     options = {name: value for name, value in vars(given).items() if name not in ("out", "work", "project", "seeds")}
@@ -47,11 +48,14 @@ def learn(given: argparse.Namespace, seed: int) -> dict[str, Any]:
     """Scores of one run: before the first step, after the last one, and by steps all along."""
     offline = given.work / f"{given.algorithm}-{given.offline_updates}"
     fit(given, offline, {"updates": given.offline_updates, "updates_per_epoch": given.offline_updates})
-    run = given.work / f"{offline.name}-online-{given.warm_start}-{given.env_steps}-{seed}"
+    kept = "-as-on-the-log" if given.as_on_the_log else ""
+    run = given.work / f"{offline.name}{kept}-online-{given.warm_start}-{given.env_steps}-{seed}"
     updates = given.warm_start + given.env_steps
     options = {"warm_start": given.warm_start, "updates": updates, "updates_per_epoch": given.every}
-    start = {"config": "online", "model.init_from": offline / "published", "model.seed": seed}
-    curves = fit(given, run, options, start | {"data.evaluation_episodes": given.episodes})
+    start = {"data.source": "online"} if given.as_on_the_log else {"config": "online"}
+    start |= {"model.init_from": offline / "published", "model.seed": seed, "seed_everything": seed}
+    start["data.evaluation_episodes"] = given.episodes
+    curves = fit(given, run, options, start)
     steps, scores = curves["train/env_steps"].fillna(0), curves["val/score"]
     curve = [[int(step), round(float(score), 2)] for step, score in zip(steps, scores, strict=True)]
     return {"before": curve[0][1], "after": curve[-1][1], "curve": curve}
