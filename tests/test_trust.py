@@ -136,6 +136,20 @@ def test_a_path_is_lost_where_it_is_promised_more_than_was_ever_paid(level, halt
     assert bool(paths.next(make_actor(), torch.ones(()), torch.Generator().manual_seed(0)).halted.all()) is halted
 
 
+def test_noise_alone_promises_no_more_than_was_paid():
+    """The model's rewards have a deviation of .1."""
+    imagined = imagination()
+    imagined.reward_range = -1.0, 0.0
+    sums = torch.tensor([0.05, 0.09, 0.11, 0.3])
+    _, prediction = linear_world().step(
+        sums[:, None] * torch.tensor([[1.0, 0.0, 0.0]]),
+        torch.zeros(4, 1),
+        mode="sample",
+        generator=torch.Generator().manual_seed(0),
+    )
+    assert imagined.overpaid(prediction).tolist() == [False, False, True, True]
+
+
 # promises
 
 

@@ -1,6 +1,5 @@
 """Policy improvement by the gradient of imagined returns, which runs through the world model step by step."""
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -109,7 +108,7 @@ class ImaginedPaths:
 
     def __init__(self, imagination: Imagination, options: ValueGradientOptions, *, believes: bool = True) -> None:
         self.imagination, self.options = imagination, options
-        self.highest = math.inf if believes else imagination.reward_range[1]
+        self.believes = believes
         self.histories: Histories | None = None
         self.former: Any = None  # the model's state that the paths before began in, whose worlds go on
 
@@ -146,7 +145,9 @@ class ImaginedPaths:
 
     def _with_ends(self, step: Step) -> tuple[Step, Tensor, Tensor]:
         fell = self.imagination.terminated(step.prediction.observation)
-        astray = lost(step.prediction, self.imagination.options.novelty_limit) | (step.prediction.reward > self.highest)
+        astray = lost(step.prediction, self.imagination.options.novelty_limit)
+        if not self.believes:
+            astray = astray | self.imagination.overpaid(step.prediction)
         return step, fell, ~fell & astray
 
     def _fresh(self, generator: torch.Generator) -> Histories:

@@ -8,7 +8,7 @@ from envtf_lit.imagination.histories import BranchPoints
 from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.imagination.rollouts import Rollouts, Rule, imagine
 from envtf_lit.policy import Policy
-from envtf_lit.world_models.interface import WorldModel
+from envtf_lit.world_models.interface import Prediction, WorldModel
 
 Batch = dict[str, Tensor]
 ROUNDS_KEPT = 3  # of rollouts: the newest rows that a ring holds
@@ -67,6 +67,13 @@ class Imagination:
     def longest(self, otherwise: int) -> int:
         """Steps of an episode: of the longest, if that was cut short; if it fell, others may last `otherwise`."""
         return self.longest_recorded if self.cut_short else max(self.longest_recorded, otherwise)
+
+    def overpaid(self, prediction: Prediction) -> Tensor:
+        """(B,) bool, whether more than any recorded reward is promised, and not by its noise alone.
+
+        Where a reward has a bound that good policies stay at, noise alone passes it at every other step.
+        """
+        return prediction.mean[:, -1] - prediction.aleatoric[:, -1] > self.reward_range[1]
 
     def charged(self, rollouts: Rollouts) -> Tensor:
         """(H, B) rewards less the penalty `weight * std(r) * u`, std(r) over the data; differentiable in the states."""

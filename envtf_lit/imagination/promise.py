@@ -20,7 +20,7 @@ class Promise:
     Attributes:
         mean: over episodes.
         error: standard error of the mean; each episode runs in a world of its own, so that it holds the model's doubt.
-        lost: share of the steps at which the model had left what it knows, or promised more than any recorded reward.
+        lost: share of the steps at which the model had left what it knows, or promised more than any recorded reward (`overpaid`).
         steps: mean length of the episodes.
     """
 
@@ -67,7 +67,7 @@ def promised(imagination: Imagination, policy: Policy, *, episodes: int, generat
         reward = step.prediction.reward.double().nan_to_num(nan=low)
         total[step.rows] += reward.clamp(low, high)
         ended[step.rows] = imagination.terminated(step.prediction.observation)
-        beyond = lost(step.prediction, options.novelty_limit) | (reward > high)
+        beyond = lost(step.prediction, options.novelty_limit) | imagination.overpaid(step.prediction)
         steps, strayed = steps + len(step.rows), strayed + int(beyond.sum())
     error = float(total.std()) / math.sqrt(episodes)
     return Promise(float(total.mean()), error, lost=strayed / max(1, steps), steps=steps / episodes)
