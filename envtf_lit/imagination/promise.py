@@ -20,7 +20,7 @@ class Promise:
     Attributes:
         mean: over episodes.
         error: standard error of the mean; each episode runs in a world of its own, so that it holds the model's doubt.
-        lost: share of the steps at which the model had left what it knows, or promised more than any recorded reward (`overpaid`).
+        lost: share of the steps at which the model had left what it knows, or was overpaid (`Imagination`).
         steps: mean length of the episodes.
     """
 
