@@ -16,7 +16,6 @@ from envtf_lit.data.loaders import (
     Windows,
     effective_episodes,
     epoch_generator,
-    with_starts,
 )
 from envtf_lit.data.sources.files import save_dataset
 
@@ -146,34 +145,6 @@ def test_other_episodes_are_weighted_by_the_same_rule():
     dataset = make_dataset()  # episode returns 3, 3 and 30
     weights = ReturnWeights.of(dataset, 0.5)
     torch.testing.assert_close(weights(dataset.select([2, 0])), weights(dataset)[[4, 5, 6, 7, 8, 0, 1, 2]])
-
-
-def test_how_episodes_begin_is_a_share_of_the_draws():
-    dataset = make_dataset((1000, 30, 200), (False,) * 3)
-    starts = torch.cat([torch.arange(64), torch.arange(1000, 1030), torch.arange(1030, 1094)])
-    rng = torch.Generator().manual_seed(0)
-    for weights in (None, torch.rand(1230, generator=rng)):
-        raised = with_starts(dataset, weights, 0.25)
-        assert float(raised[starts].sum() / raised.sum()) == pytest.approx(0.25)
-        before = torch.ones(1230) if weights is None else weights
-        kept = torch.ones(1230, dtype=torch.bool)
-        kept[starts] = False
-        for rows in (kept, ~kept):  # among themselves they are drawn as before
-            ratio = raised[rows] / before[rows]
-            torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio))
-        assert torch.equal(with_starts(dataset, raised, 0.2), raised)  # there are more already
-
-
-def test_an_agent_may_ask_for_starts(tmp_path):
-    dataset = make_dataset((300,) * 10, (False,) * 10)
-    save_dataset(replace(dataset, action_high=np.asarray(dataset.actions).max(0)), tmp_path / "log.h5")
-    data = TransitionData(str(tmp_path / "log.h5"), return_temperature=0.5)
-    before = data.weights
-    data.start_share = 0.6
-    assert before is not None and data.weights is not None
-    torch.testing.assert_close(data.weights, with_starts(data.dataset, before, 0.6))
-    drawn = torch.cat([batch["observations"][..., 0].flatten() for batch in data.train_dataloader()]) % 300
-    assert float((drawn < 64).float().mean()) == pytest.approx(0.6, abs=0.02)
 
 
 def test_effective_episodes_count_by_their_share_of_the_rows():

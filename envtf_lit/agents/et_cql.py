@@ -23,8 +23,6 @@ from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.options.numbers import Count, Natural, NonNegative, NonzeroShare, Positive
 from envtf_lit.options.schema import rare
 
-START_SHARE = 0.25  # of the rows, those of how episodes begin: in 1,000 nearly equal steps a clone learns it too late
-
 
 @dataclass(frozen=True)
 class PaperRolloutOptions(RolloutOptions):
@@ -159,9 +157,8 @@ class ETCQL(COMBO):
         yield "critics", loss, logs
 
     def setup(self, stage: str) -> None:
-        data: TransitionData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
-        data.start_share = START_SHARE
         super().setup(stage)
+        data: TransitionData = self.trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
         if data.validation_rows is None:
             raise UserError(
                 f"{self.label} watches its likelihood of held-out episodes, and none are held out: give the share of "

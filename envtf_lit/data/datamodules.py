@@ -18,7 +18,6 @@ from envtf_lit.data.loaders import (
     Windows,
     effective_episodes,
     epoch_generator,
-    with_starts,
 )
 from envtf_lit.data.options import UPDATES_PER_STEP
 from envtf_lit.data.sources.files import load_dataset
@@ -116,7 +115,6 @@ class TransitionData(L.LightningDataModule):
 
     Attributes:
         chances: (N,) of each row, beside those of `ReturnWeights`; None for equal ones. An agent may set them.
-        start_share: of the draws, how many at least are of episodes' first steps (`with_starts`). An agent may set it.
         dataset: what is learned from.
         validation: that half of the held-out episodes which may choose between actors; None where all are learned from.
 
@@ -153,7 +151,7 @@ class TransitionData(L.LightningDataModule):
         self.batch_size, self.steps_per_epoch = batch_size, steps_per_epoch
         self.discount, self.n_step, self.seed = discount, n_step, seed
         self.return_temperature, self.fewest_episodes = return_temperature, fewest_episodes
-        self.chances, self.start_share = None, 0.0
+        self.chances = None
         self.dataset, self.validation = self.read(path), None
         if held_out > 0:
             self.dataset, unseen = self.dataset.split(held_out, seed=seed)
@@ -170,13 +168,13 @@ class TransitionData(L.LightningDataModule):
         """All rows of the dataset, with their n-step targets and returns to go."""
         return Transitions(self.dataset, discount=self.discount, n_step=self.n_step, device=_device(self))
 
-    @property
+    @cached_property
     def weights(self) -> Tensor | None:
         """(N,) chances of each row, up to a factor; None where they are equal."""
-        weights = self.chances
-        if self.return_weights is not None:
-            weights = self.return_weights(self.dataset) * (1.0 if weights is None else weights)
-        return with_starts(self.dataset, weights, self.start_share) if self.start_share > 0 else weights
+        if self.return_weights is None:
+            return self.chances
+        weights = self.return_weights(self.dataset)
+        return weights if self.chances is None else weights * self.chances
 
     @cached_property
     def return_weights(self) -> ReturnWeights | None:
@@ -187,13 +185,13 @@ class TransitionData(L.LightningDataModule):
 
     @cached_property
     def validation_rows(self) -> DrawnRows | None:
-        """Rows of held-out episodes, weighted as those of training but for their starts, of which few are held out."""
+        """Rows of held-out episodes, drawn by the same rule as those of training; None where all are learned from."""
         if self.validation is None:
             return None
         weights = None if self.return_weights is None else self.return_weights(self.validation)
         return DrawnRows(self.validation, weights, _device(self))
 
-    @property
+    @cached_property
     def effective_episodes(self) -> float:
         """How many episodes rows come from, each counted by its share (`loaders.effective_episodes`)."""
         weights = torch.ones(len(self.dataset)) if self.weights is None else self.weights

@@ -19,7 +19,6 @@ from envtf_lit.data.columns import Column, FileRows, column_blocks
 from envtf_lit.data.dataset import OfflineDataset
 
 BISECTIONS = 30  # of a temperature
-START = 64  # steps that an episode begins with
 
 
 def epoch_generator(seed: int, epoch: int, stream: str, device: torch.device | str = "cpu") -> torch.Generator:
@@ -139,25 +138,6 @@ class ReturnWeights:
         """(N,) weights of the rows of this dataset or of another, such as what was held out of it."""
         scaled = (dataset.episode_returns - self.lowest) / self.spread
         return torch.as_tensor(np.exp((scaled.clip(0.0, 1.0) - 1.0) * self.inverse)[dataset.episode_index])
-
-
-def with_starts(dataset: OfflineDataset, weights: Tensor | None, share: float) -> Tensor:
-    """(N,) weights raised on episodes' first `START` steps, so that at least this share of the draws are of those.
-
-    A clone that begins badly never comes to the states it knows well. Of long episodes few rows show how they begin.
-
-    Args:
-        dataset: whose rows.
-        weights: (N,) chances, up to a factor; None for equal ones.
-        share: in [0, 1).
-    """
-    weights = torch.ones(len(dataset), dtype=torch.float64) if weights is None else weights.double()
-    steps = np.arange(len(dataset)) - dataset.episode_starts[dataset.episode_index]
-    starts = torch.as_tensor(steps < START)
-    now = float(weights[starts].sum() / weights.sum())
-    if now >= share:
-        return weights
-    return torch.where(starts, weights * (share / (1.0 - share)) * ((1.0 - now) / now), weights)
 
 
 def effective_episodes(dataset: OfflineDataset, weights: Tensor) -> float:
