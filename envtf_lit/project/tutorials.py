@@ -53,7 +53,10 @@ def tutorials(folder: Path = Path("notebooks")) -> list[str]:
     """
     names = sorted(path.stem for path in folder.glob("[0-9]*.ipynb"))
     if not names:
-        raise UserError(f"{folder} has no tutorials: they are in the notebooks/ of a checkout of the repository.")
+        raise UserError(
+            f"{folder} has no tutorials: run it in a checkout of the repository, or name its notebooks/ with "
+            "--notebooks DIR."
+        )
     return names
 
 
