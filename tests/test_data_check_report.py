@@ -128,6 +128,26 @@ def test_check_prints_and_exits_by_what_it_finds(tmp_path: Path, capsys: pytest.
         assert "not usable: " in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("name", "ours", "told"),
+    [
+        ("reward", "rewards", "rewards"),
+        ("obs", "observations", "observations"),
+        ("acts", "actions", "actions"),
+        ("dones", "terminals", "terminals"),
+        ("Truncations", "timeouts", "timeouts"),
+    ],
+)
+def test_a_column_under_another_name_is_told_to_be_renamed(tmp_path: Path, name: str, ours: str, told: str):
+    save_dataset(walker_dataset(), tmp_path / "log.npz")
+    columns = dict(np.load(tmp_path / "log.npz"))
+    np.savez(tmp_path / "odd.npz", **{name if key == ours else key: values for key, values in columns.items()})
+    (note,) = [found for found in inspect_source(tmp_path / "odd.npz").findings if "is not read" in found.what]
+    assert note.what == f"{name!r} is not read" and note.fix == f"if it is what we call {told!r}, rename it"
+    np.savez(tmp_path / "both.npz", **columns, **{name: columns[ours]})
+    assert not [found for found in inspect_source(tmp_path / "both.npz").findings if "is not read" in found.what]
+
+
 def test_minari_datasets_are_checked_by_id_and_by_folder(minari_root: Path, capsys: pytest.CaptureFixture[str]):
     write_minari(walker_dataset(episodes=4), "my/walker-v0")
     for source in ("minari:my/walker-v0", str(minari_root / "my/walker-v0")):

@@ -17,6 +17,7 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.findings import Finding
 from envtf_lit.data.outliers import wild_values
 from envtf_lit.data.sources.local import open_source
+from envtf_lit.data.sources.raw import ALIASES, Raw
 from envtf_lit.data.statistics import CONSTANT
 from envtf_lit.errors import UserError
 from envtf_lit.robots.tasks import get_task
@@ -25,6 +26,15 @@ STYLES = {"error": "bold red", "warning": "yellow", "note": "cyan"}  # the grave
 BARS = 10  # of the histogram of returns
 MIXER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: odd, and without pattern
 HUGE = 1e8  # a magnitude that float32 arithmetic, which squares, does not go well with
+# what others call a column, in the singular
+USUAL = {
+    **dict.fromkeys(("ob", "observation", "state"), "observations"),
+    **dict.fromkeys(("act", "action"), "actions"),
+    **dict.fromkeys(("rew", "reward"), "rewards"),
+    **dict.fromkeys(("next_ob", "next_observation", "next_state"), "next_observations"),
+    **dict.fromkeys(("done", "terminal", "termination"), "terminated"),
+    **dict.fromkeys(("timeout", "truncation"), "truncated"),
+}
 SEAM = 1e-3  # of a dimension's standard deviation: more between s' and the next row's s is a gap
 
 
@@ -81,13 +91,22 @@ def inspect_source(source: str | Path, *, task: str | None = None) -> Inspection
             result.columns = [_describe(name, values) for name, values in raw.columns.items()]
             result.ignored = raw.ignored
             result.dataset, result.findings = examine(raw.columns, raw.attributes, task=task, broken=raw.broken)
-            result.findings += raw.notes
+            result.findings += [*_misnamed(raw), *raw.notes]
     except UserError as error:
         result.findings = [Finding("error", str(error).rstrip("."))]
     if result.dataset is not None:
         result.findings += quality(result.dataset)
     result.findings.sort(key=lambda finding: list(STYLES).index(finding.kind))
     return result
+
+
+def _misnamed(raw: Raw) -> Iterator[Finding]:
+    """What lies there under a name that others use for a column that is missing."""
+    there = {*raw.columns, *raw.broken}
+    for name in raw.ignored:
+        ours = USUAL.get(name.lower().removesuffix("s"))
+        if ours is not None and ours not in there:
+            yield Finding("note", f"{name!r} is not read", f"if it is what we call {ALIASES[ours][0]!r}, rename it")
 
 
 def _describe(name: str, values: Any) -> Column:
