@@ -128,7 +128,16 @@ class Actor(nn.Module, ABC):
             first.bias.copy_(theirs.bias + theirs.weight @ shift)
 
     def outputs(self, observation: Tensor) -> Tensor:
-        """Observations (..., S) to what the network says of them (..., heads * A), in fp32."""
+        """Observations (..., S) to what the network says of them (..., heads * A), in fp32.
+
+        Raises:
+            UserError: they are not as wide as the actor's.
+        """
+        if observation.shape[-1:] != self.observation_mean.shape:
+            raise UserError(
+                f"The policy takes observations of {len(self.observation_mean)} numbers: these have the shape "
+                f"{tuple(observation.shape)}."
+            )
         x = (observation - self.observation_mean) / self.observation_std
         *hidden, last = self.net
         for layer in hidden:
@@ -158,21 +167,16 @@ class Actor(nn.Module, ABC):
             generator: of what is drawn.
 
         Raises:
-            UserError: an array is not as wide as the actor's observations.
+            UserError: it is not as wide as the actor's observations.
         """
+        given = observation
+        if not isinstance(given, Tensor):
+            given = torch.as_tensor(np.asarray(given, np.float32), device=self.observation_mean.device)
         with torch.no_grad():
-            if isinstance(observation, Tensor):
-                if observation.dtype == torch.float64:  # as simulators have it
-                    return self._act(observation.float(), deterministic, generator).double()
-                return self._act(observation, deterministic, generator)
-            array = np.asarray(observation, np.float32)
-            width = len(self.observation_mean)
-            if array.ndim == 0 or array.shape[-1] != width:
-                raise UserError(
-                    f"The policy takes observations of {width} numbers: these have the shape {array.shape}."
-                )
-            rows = torch.as_tensor(array, device=self.observation_mean.device)
-            return self._act(rows, deterministic, generator).cpu().numpy()
+            action = self._act(given.float() if given.dtype == torch.float64 else given, deterministic, generator)
+        if not isinstance(observation, Tensor):
+            return action.cpu().numpy()
+        return action.double() if given.dtype == torch.float64 else action
 
     @abstractmethod
     def _act(self, observation: Tensor, deterministic: bool, generator: torch.Generator | None) -> Tensor:
