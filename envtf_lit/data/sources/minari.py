@@ -220,13 +220,17 @@ def _open(folder: Path, source: str) -> "MinariDataset":
         # minari would import the code that the metadata name, to ask it for its spaces
         raise UserError(f"{source} does not say its spaces: write it anew with Minari 0.5 or newer.")
     if metadata.get("data_format") == "hdf5":
-        _check_file(folder / HDF5_FILE, source)
-    _check_count(folder, metadata.get("total_episodes"), source)
+        there = _check_file(folder / HDF5_FILE, source)
+    else:
+        there = sum(1 for entry in folder.iterdir() if entry.is_dir())
+    told = metadata.get("total_episodes")  # as many are laid out by Minari, before it looks for them
+    if type(told) is not int or not 0 <= told <= there:
+        raise UserError(f"{source} says that it has {told!s:.40} episodes and holds {there}: fetch or write it anew.")
     return MinariDataset(folder)
 
 
-def _check_file(path: Path, source: str) -> None:
-    """Nothing that leads to another file or to the same place again, and no sizes that the file cannot hold."""
+def _check_file(path: Path, source: str) -> int:
+    """The number of episodes; nothing may lead to another file or to the same place again, nor be larger than it."""
     declared, seen = {}, set[Any]()
 
     def visit(group: h5py.Group) -> None:
@@ -246,18 +250,9 @@ def _check_file(path: Path, source: str) -> None:
     with h5py.File(path, "r") as file:
         seen.add(file["/"])
         visit(file)
+        episodes = len(file)
     check_size(path, declared)
-
-
-def _check_count(folder: Path, told: Any, source: str) -> None:
-    """Minari lays out as many episodes as the metadata say, before it looks for them."""
-    if (folder / HDF5_FILE).exists():
-        with h5py.File(folder / HDF5_FILE, "r") as file:
-            there = len(file)
-    else:
-        there = sum(1 for entry in folder.iterdir() if entry.is_dir())
-    if type(told) is not int or not 0 <= told <= there:
-        raise UserError(f"{source} says that it has {told!s:.40} episodes and holds {there}: fetch or write it anew.")
+    return episodes
 
 
 def _check_spaces(dataset: "MinariDataset", source: str) -> None:
