@@ -65,7 +65,11 @@ class Interaction:
                 f"The policy asks for the action {actions.tolist()} after {self.steps} steps: its training diverged, "
                 "so lower actor_learning_rate."
             )
-        following, rewards, terminated, truncated, _ = self._played(actions.numpy())
+        following, rewards, terminated, truncated, _ = self.envs.step(actions.numpy())
+        following = following.astype(np.float32)
+        self.earned += rewards
+        for taken, action in zip(self.taken, actions.numpy(), strict=True):
+            taken.append(action)
         rows = dict(
             observations=observations,
             actions=actions,
@@ -109,13 +113,6 @@ class Interaction:
                 f"{self.robot.env_id} does not come to the same place by the same actions, so that a run in it cannot "
                 "be continued: train anew, or start from what was published with --model.init_from."
             )
-
-    def _played(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        following, rewards, terminated, truncated, info = self.envs.step(actions)
-        self.earned += rewards
-        for taken, action in zip(self.taken, actions, strict=True):
-            taken.append(action)
-        return following.astype(np.float32), rewards, terminated, truncated, info
 
     def _begin(self, which: np.ndarray) -> np.ndarray:
         """Begins an episode in each environment of a mask (E,); returns where all stand, (E, S)."""
