@@ -25,6 +25,7 @@ from tests.test_training import (
     bytes_of,
     kill_in_epoch,
     killed,
+    killed_run,
     train_whole,
     train_with,
 )
@@ -181,11 +182,7 @@ DAMAGES = [(name, damage) for damage in (torn, empty, never_written, another_fil
 @pytest.mark.parametrize(("name", "damage"), [*DAMAGES, ("best", Path.unlink)])
 def test_a_damaged_checkpoint_is_set_aside_and_training_starts_anew(root, monkeypatch, capsys, name, damage):
     expected = train_whole(root)
-    with monkeypatch.context() as patch:
-        kill_in_epoch(patch, 2)
-        with pytest.raises(Killed):
-            train_whole(root)
-    (run,) = (root / ".envtf/runs").iterdir()
+    run = killed_run(root, monkeypatch)
     damage(run / f"{name}.ckpt")
     capsys.readouterr()
     with monkeypatch.context() as patch:
@@ -203,11 +200,7 @@ def test_a_damaged_checkpoint_is_set_aside_and_training_starts_anew(root, monkey
 
 def test_a_checkpoint_of_another_version_is_set_aside(root, monkeypatch, capsys):
     expected = train_whole(root)
-    with monkeypatch.context() as patch:
-        kill_in_epoch(patch, 2)
-        with pytest.raises(Killed):
-            train_whole(root)
-    (run,) = (root / ".envtf/runs").iterdir()
+    run = killed_run(root, monkeypatch)
     saved = torch.load(run / "last.ckpt", weights_only=True)
     saved["state_dict"]["horizon"] = torch.zeros(3)
     torch.save(saved, run / "last.ckpt")

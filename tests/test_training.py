@@ -118,13 +118,19 @@ def train_whole(root: Path, params: Params = TINY) -> dict[str, bytes]:
     return bytes_of(root / WORLD_MODEL)
 
 
-def test_a_killed_model_run_resumes_to_the_same_bits(root, monkeypatch):
-    expected = train_whole(root)
+def killed_run(root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a run that was killed in its third epoch."""
     with monkeypatch.context() as patch:
         kill_in_epoch(patch, 2)
         with pytest.raises(Killed):
             train_whole(root)
     (run,) = (root / ".envtf/runs").iterdir()
+    return run
+
+
+def test_a_killed_model_run_resumes_to_the_same_bits(root, monkeypatch):
+    expected = train_whole(root)
+    run = killed_run(root, monkeypatch)
     assert torch.load(run / "last.ckpt", weights_only=True)["epoch"] == 1
     assert train_whole(root) == expected
     assert not run.exists()
