@@ -1,4 +1,4 @@
-"""One look for every progress bar, on standard error: what a command prints is its result."""
+"""What is said while work goes on, on standard error: what a command prints is its result."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,3 +26,8 @@ def progress_bar(
     layout = (TextColumn("{task.description}"), BarColumn(), *middle, TimeRemainingColumn())
     with Progress(*layout, console=Console(stderr=True), disable=not visible) as bar:
         yield partial(bar.update, bar.add_task(title, total=total, **fields))
+
+
+def note(sentence: str) -> None:
+    """A sentence in yellow, as it is: brackets in a path are no markup, and lines are not broken."""
+    Console(stderr=True).print(sentence, style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -17,13 +17,13 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from rich.console import Console
 from torch import nn
 
 from envtf_lit.divergence import check_epoch
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import check_writable, replacing, write_json, write_table
 from envtf_lit.options.schema import Precision
+from envtf_lit.progress import note
 
 logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # says what hardware there is at every fit
 RUNS = Path(".envtf/runs")
@@ -198,8 +198,7 @@ def _checkpoint(run: Path, names: Sequence[str], module: nn.Module) -> Path | No
     for path in paths:  # together, since one without the other would lead a later run astray
         if path.exists():
             path.replace(path.with_name(f"{path.name}.unreadable"))
-    sentence = f"{found[0]} {found[1]}: it is set aside, and training starts anew."
-    Console(stderr=True).print(sentence, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    note(f"{found[0]} {found[1]}: it is set aside, and training starts anew.")
     return None
 
 

@@ -1,10 +1,10 @@
 """Whether an environment is the one that a log was recorded in."""
 
 import numpy as np
-from rich.console import Console
 
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.errors import UserError
+from envtf_lit.progress import note
 from envtf_lit.robots.tasks import Robot, find_task
 
 Limits = tuple[np.ndarray, np.ndarray]  # least and largest actions, (A,) each
@@ -44,8 +44,7 @@ def check_match(log: OfflineDataset, robot: Robot, limits: Limits) -> None:
         )
     found = differences(log, robot, limits)
     if found:
-        note = f"The environment is not the log's: {'; '.join(found)}. Rows of the log teach what holds there."
-        Console(stderr=True).print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
+        note(f"The environment is not the log's: {'; '.join(found)}. Rows of the log teach what holds there.")
 
 
 def differences(log: OfflineDataset, robot: Robot, limits: Limits) -> list[str]:

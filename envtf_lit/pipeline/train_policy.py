@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from lightning.pytorch.callbacks import Callback
-from rich.console import Console
 
 from envtf_lit.agents.combo import MixingOptions
 from envtf_lit.agents.options import PolicyOptions
@@ -26,6 +25,7 @@ from envtf_lit.pipeline.stage import (
     run_stage,
     unseen,
 )
+from envtf_lit.progress import note
 from envtf_lit.training import pick_device, run_folder, trained
 from envtf_lit.world_models.fit import REACH, known_reach
 from envtf_lit.world_models.observed import as_observed
@@ -113,8 +113,7 @@ def within_reach(options: MixingOptions, model: Path) -> MixingOptions:
         return options
     asked, now = options.path_lengths, cut.path_lengths
     changes = [f"{name} is {now[name]}, not {length}" for name, length in asked.items() if now[name] != length]
-    note = f"{model} reaches {steps} steps before its error passes 0.1 ({REACH}): {' and '.join(changes)}."
-    Console(stderr=True).print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    note(f"{model} reaches {steps} steps before its error passes 0.1 ({REACH}): {' and '.join(changes)}.")
     return cut
 
 
