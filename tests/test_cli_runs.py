@@ -13,10 +13,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from envtf_lit.data.sources.files import load_dataset, save_dataset
 from envtf_lit.pipeline.yaml import dump_params, load_params, params_yaml, preset_params
+from tests import logs
 from tests.full_disk import full_disk
 from tests.lightning_runs import NO_LOGGER, QUIET
 from tests.test_cli import LIGHTNING, exit_status
@@ -172,6 +174,43 @@ def test_init_leaves_an_existing_project_alone(tmp_path: Path, capsys: pytest.Ca
     assert "exists already" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["dvc.yaml"]
     assert (tmp_path / "dvc.yaml").read_text() == "mine"
+
+
+def test_init_with_a_log_checks_it_and_trains_on_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    logs.write(tmp_path / "mine.npz", logs.columns(4, 2))
+    assert exit_status(["init", "projects/new", "--preset", "tiny", "--data", "mine.npz"]) == 0
+    assert "12 transitions" in capsys.readouterr().out
+    params = load_params("projects/new/params.yaml")
+    assert (params.task, params.download.source, params.download.path) == (None, "file", "../../mine.npz")
+    assert params.train_model == preset_params("tiny").train_model
+    monkeypatch.chdir("projects/new")
+    assert exit_status(["download", "--quiet"]) == 0
+    assert load_dataset("data/dataset.h5").observation_dim == 4
+
+
+def test_init_with_a_log_that_names_its_task_says_how_to_score_in_mujoco(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = logs.write(tmp_path / "mine.h5", logs.columns() | {"task": "hopper-medium"})
+    assert exit_status(["init", str(tmp_path / "new"), "--data", str(file)]) == 0
+    assert "`task: hopper-medium`" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("name", ["bad.npz", "log.csv", "missing.h5"])
+def test_init_writes_nothing_for_a_log_that_cannot_be_trained_on(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs.write(tmp_path / "bad.npz", logs.columns() | {"rewards": np.full(12, np.nan)})
+    (tmp_path / "log.csv").write_text("a,b")
+    assert exit_status(["init", str(tmp_path / "new"), "--data", str(tmp_path / name)]) == 2
+    said = capsys.readouterr()
+    assert {"bad.npz": "mend the file first", "log.csv": "envtf data convert", "missing.h5": "is not a file"}[name] in (
+        " ".join((said.out + said.err).split())
+    )
+    assert not (tmp_path / "new").exists()
 
 
 def test_doctor_reports_what_a_bug_report_needs(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,26 +7,46 @@ from pathlib import Path
 from typing import Annotated
 
 from envtf_lit.cli.output import console
-from envtf_lit.cli.signatures import Folder, run_command
+from envtf_lit.cli.signatures import File, Folder, run_command
 from envtf_lit.errors import UserError
 
 Tutorial = Annotated[str, "NAME"]
 
 
-def init(folder: Folder, /, *, preset: str = "small") -> None:
+def init(folder: Folder, /, *, preset: str = "small", data: File | None = None) -> None:
     """Writes a new project.
 
     Args:
         folder: created if missing; must not hold a dvc.yaml.
         preset: tiny, small, base or paper.
+        data: an HDF5 or NPZ log of a robot of yours, that the project trains on; it is checked first, as `envtf data
+            check` does, and stays where it is.
     """
     from envtf_lit.project.template import write_project
 
-    kept = write_project(folder, preset)
+    if data is not None:
+        _check(data)
+    kept = write_project(folder, preset, data)
     if kept:
         console().print(f"Left as they were: {', '.join(kept)}")
     first = "" if find_spec("dvc") else "pip install 'envtf-lit[pipeline]' && "
     console().print(f"Wrote a project to {folder}. Next: {first}cd {folder} && dvc repro")
+
+
+def _check(data: Path) -> None:
+    """Prints what there is to say of a file; exits with status 2 where it cannot be used."""
+    from envtf_lit.data.check_report import inspect_source, render
+    from envtf_lit.data.sources.files import is_hdf5
+
+    is_hdf5(data)  # of the formats that `envtf data check` reads, the pipeline reads two
+    inspection = inspect_source(data)
+    console().print(render(inspection))
+    if not inspection.usable:
+        console().print("No project was written: mend the file first.")
+        raise SystemExit(2)
+    if inspection.dataset is not None and inspection.dataset.task is not None:
+        name = inspection.dataset.task
+        console().print(f"The file names its task: write `task: {name}` in params.yaml to score policies in MuJoCo.")
 
 
 def params(*, preset: str = "small", algorithm: str | None = None, task: str | None = None) -> None:

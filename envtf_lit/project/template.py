@@ -3,12 +3,15 @@
 import os
 import subprocess
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from ruamel.yaml import YAML
 
+from envtf_lit.data.options import DownloadOptions
 from envtf_lit.errors import UserError
 from envtf_lit.files import replacing, write_text
+from envtf_lit.pipeline.params import Params
 from envtf_lit.pipeline.yaml import params_yaml, preset_params
 
 PLAIN_FILES = (".dvcignore", ".gitignore")
@@ -22,10 +25,15 @@ def template_folder() -> Path:
     return shipped if shipped.is_dir() else package.parent
 
 
-def write_project(folder: Path, preset: str) -> list[str]:
+def write_project(folder: Path, preset: str, data: Path | None = None) -> list[str]:
     """Writes dvc.yaml, params.yaml of that preset, the report's notebooks, and DVC's settings into `folder`.
 
     Nothing that lies there is changed. Settings of git and DVC that are there already stay in force.
+
+    Args:
+        folder: created if missing.
+        preset: of the options.
+        data: log of a robot without a simulator that takes the place of the zoo's; None keeps that.
 
     Returns:
         The names of those settings.
@@ -33,7 +41,8 @@ def write_project(folder: Path, preset: str) -> list[str]:
     Raises:
         UserError: no such preset, a project is there already, or other files have the names of the project's.
     """
-    params = params_yaml(preset_params(preset))
+    params = preset_params(preset)
+    params = params_yaml(params if data is None else _of_own_robot(params, folder, data))
     if os.path.lexists(folder / "dvc.yaml"):
         raise UserError(
             f"{folder}/dvc.yaml exists already: choose another folder, or `envtf params` for a params.yaml."
@@ -49,6 +58,12 @@ def write_project(folder: Path, preset: str) -> list[str]:
         write_text(folder / name, text)
     _write_pipeline(source / "dvc.yaml", folder / "dvc.yaml")
     return [name for name in kept if (folder / name).read_bytes() != settings[name].encode()]
+
+
+def _of_own_robot(params: Params, folder: Path, data: Path) -> Params:
+    """The options with a log of one's own, at its place as seen from the project."""
+    path = os.path.relpath(os.path.realpath(data.expanduser()), os.path.realpath(folder))
+    return replace(params, task=None, download=DownloadOptions(source="file", path=path))
 
 
 def _dvc_settings(folder: Path) -> dict[str, str]:
