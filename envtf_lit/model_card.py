@@ -22,6 +22,62 @@ WHAT = {
     "ensemble_dynamics": "A world model: an ensemble that predicts next state and reward, and its uncertainty.",
 }
 
+GLOSSARY = (
+    "Formulas, and numbers that no line explains: `docs/metrics.md`, Metrics, in the documentation of envtf_lit. Q and "
+    "losses of policies are in standard deviations of the log's returns, unless the settings say "
+    "`normalise_returns: false`."
+)
+SCALE = "0 is a random policy, 100 D4RL's expert"
+# what a number is, and where it should lie
+DATA_MEANS = {
+    "task": "the robot, and which policies recorded it",
+    "transitions": "recorded steps",
+    "episodes": "recorded episodes",
+    "score_mean": f"of the recorded episodes; {SCALE}",
+    "score_max": "the best recorded episode's",
+    "return_mean": "sum of an episode's rewards, mean over the recorded ones",
+    "return_max": "the best recorded episode's",
+}
+POLICY_MEANS = {
+    "score_mean": f"of its episodes in MuJoCo; {SCALE}; healthy: above the data's",
+    "score_std": "spread over episodes, not over seeds",
+    "return_mean": "sum of an episode's rewards in MuJoCo, mean over episodes",
+    "return_std": "spread over episodes",
+    "episodes": "that were played",
+    "effective_episodes": "recorded episodes that it learned from, each counted by its share; healthy: dozens",
+    "clone_return_mean": "return_mean of the clone that it began from; healthy: less than its own",
+    "imagined_return_mean": "sum of an episode's rewards in the world model, whose opinion it is: nobody measured it",
+    "imagined_return_std": "spread over episodes",
+    "action_error": "squared distance from held-out actions over their variance; 0 copies them, 1 is the mean action's",
+    "epoch": "of training, as are all numbers below",
+    "clone_loss": "-log-likelihood of recorded actions, per dimension; less is nearer to the log",
+    "held_out_clone_loss": "the same of episodes that it did not learn from; healthy: near clone_loss",
+    "bellman_loss": "squared error of Q against its targets; healthy: small beside Q squared",
+    "conservative_gap": "by how much Q prefers actions that the log lacks; healthy: below 0, or falling",
+    "q_data": "mean Q of recorded actions; healthy: level",
+    "q_target": "mean of what Q is fitted to; healthy: level",
+    "q_policy": "mean Q of its own actions; healthy: not far above q_data",
+    "entropy": "of its actions; healthy: near -(number of action dimensions)",
+    "alpha": "weight of the entropy; healthy: level",
+    "imagined_value": "discounted return of the imagined paths that it was improved on, in the log's rewards",
+    "trust_weight": "what holds it to the log; healthy: 0.01 to 1, and below its bound of 100",
+    "cut_share": "share of imagined paths that left what the world model knows; healthy: small, 1 is all of them",
+}
+MODEL_MEANS = {
+    "parameters": "numbers that were learned",
+    "epoch": "of training whose weights these are",
+    "open_loop_error": "of held-out stretches, fed its own predictions: squared error over the data's variance",
+    "val_loss": "training's objective on held-out episodes; it need not fall while errors do",
+    "open_loop_0.1_median": "reach: steps within which half of the held-out stretches keep an error below 0.1; to 100",
+    "termination_recall": "share of held-out terminations that are found; healthy: above 0.8",
+    "termination_false_alarms": "share of other steps called one; healthy: far below one in an episode's length",
+    "nmse_one_step": "squared error one step ahead over the data's variance; healthy: below 0.01, 1 is the mean's",
+    "coverage_50": "share of outcomes in its 50 % intervals; healthy: near 0.50, less is overconfident",
+    "coverage_90": "share of outcomes in its 90 % intervals; healthy: near 0.90, less is overconfident",
+    "open_loop_steps_0.01": "mean steps before the error passes 0.01, fed its own predictions; more is better",
+    "teacher_forced_steps_0.01": "the same, shown the true state before every step; healthy: above the former",
+}
+
 
 def model_card(folder: str | Path, *, report: str | Path | None = None, licence: str = UNKNOWN) -> str:
     """The text of a model's card, with the hub's front matter.
@@ -39,7 +95,7 @@ def model_card(folder: str | Path, *, report: str | Path | None = None, licence:
         raise UserError(f"{licence!r} names no licence: write it as the hub does, such as mit or apache-2.0.")
     model, name = load_model(folder), folder.resolve().name
     kind = kind_of(model) if isinstance(model, Actor) else str(read_json(folder / "config.json")["kind"])
-    found = _record(report)
+    found, means = _record(report), POLICY_MEANS if isinstance(model, Actor) else MODEL_MEANS
     tags = [
         "reinforcement-learning",
         "offline-reinforcement-learning",
@@ -50,12 +106,13 @@ def model_card(folder: str | Path, *, report: str | Path | None = None, licence:
         "---\n" + "\n".join(f"{key}: {json.dumps(value)}" for key, value in front.items()) + "\n---",
         f"# {name}\n\n{WHAT[kind]}",
         f"```python\nimport envtf_lit\n\n{_use(model, folder)}\n```",
-        *_section("Data", _data(found)),
-        *_section("Scores", _scores(model, name, found) | _numbers(_record(folder / "metrics.json"))),
-        *([] if isinstance(model, Actor) else _section("Calibration", _calibration(name, found))),
+        *_section("Data", _data(found), DATA_MEANS),
+        *_section("Scores", _scores(model, name, found) | _numbers(_record(folder / "metrics.json")), means),
+        *([] if isinstance(model, Actor) else _section("Calibration", _calibration(name, found), means)),
+        GLOSSARY,
         f"## Limits\n\n{_limits(model)}",
         *_options(_record(folder / "resolved.json")),
-        *_section("Versions", {package: version(package) for package in ("envtf-lit", "torch")}),
+        *_section("Versions", {package: version(package) for package in ("envtf-lit", "torch")}, {}),
         "## Licence\n\n" + ("None was stated: ask whoever trained it." if licence == UNKNOWN else f"`{licence}`"),
     ]
     return "\n\n".join(parts) + "\n"
@@ -98,11 +155,11 @@ def _calibration(name: str, found: dict[str, Any]) -> dict[str, Any]:
     return _numbers(scored) if scored.get("name") == name else {}
 
 
-def _section(title: str, facts: dict[str, Any]) -> list[str]:
+def _section(title: str, facts: dict[str, Any], means: dict[str, str]) -> list[str]:
     if not facts:
         return [f"## {title}\n\nNot recorded beside this model."]
-    lines = [f"| {_cell(key)} | {_cell(value)} |" for key, value in facts.items()]
-    return ["\n".join([f"## {title}\n", "| | |", "|---|---|", *lines])]
+    lines = [f"| {_cell(key)} | {_cell(value)} | {means.get(key, '')} |" for key, value in facts.items()]
+    return ["\n".join([f"## {title}\n", "| | | |", "|---|---|---|", *lines])]
 
 
 def _cell(value: Any) -> str:
@@ -125,7 +182,11 @@ def _use(model: Model, folder: Path) -> str:
         if (folder / CRITICS).is_dir():
             lines.append('value = envtf_lit.load_critics("FOLDER").value(observation)  # (B,), of discounted rewards')
         return "\n".join(lines)
-    return 'model = envtf_lit.load_world_model("FOLDER")\nstate, prediction = model.step(state, action)'
+    return (
+        'model = envtf_lit.load_world_model("FOLDER")\n'
+        "state = model.init(observations, actions, lengths)  # (B, T, S), (B, T - 1, A), (B,): seen and done so far\n"
+        "state, prediction = model.step(state, action)  # (B, A)"
+    )
 
 
 def _limits(model: Model) -> str:

@@ -1,6 +1,7 @@
 """Models that travel: to a folder, to a hub over HTTP, and back; cards; and all that a hub may do wrong."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,12 +15,13 @@ from envtf_lit.cli.main import main
 from envtf_lit.critics import Critics, load_critics, save_critics
 from envtf_lit.errors import UserError
 from envtf_lit.files import write_json
-from envtf_lit.model_card import model_card
+from envtf_lit.model_card import DATA_MEANS, MODEL_MEANS, POLICY_MEANS, model_card
 from envtf_lit.policy import load_policy, save_policy
 from envtf_lit.sharing import ALLOWED, pull, push
 from envtf_lit.world_models.store import load_world_model, save_world_model
 from envtf_lit.world_models.termination_head import TerminationHead, save_termination
 from tests.hub import Hub, running
+from tests.test_dvc import ROOT
 from tests.worlds import small_transformer
 
 
@@ -251,7 +253,8 @@ def test_a_card_says_what_is_known(policy: Path, tmp_path: Path, monkeypatch: py
     text = (policy / "README.md").read_text()
     assert front(text)["license"] == "mit" and front(text)["library_name"] == "envtf_lit"
     for line in ("# mine", "| task | hopper-medium-replay |", "| transitions | 100000 |", "| score_mean | 93.92 |"):
-        assert f"\n{line}\n" in text, line
+        assert f"\n{line}" in text, line
+    assert "| score_mean | 93.92 | of its episodes in MuJoCo; 0 is a random policy" in text
     assert "actions from [-1.0, -1.0] to [1.0, 1.0]" in text and '"algorithm": "cql"' in text
     assert "load_critics" not in text
     assert "| clone_loss | -3.25 |" in text and "| envtf-lit |" in text and "Calibration" not in text
@@ -263,9 +266,19 @@ def test_a_card_says_what_is_known(policy: Path, tmp_path: Path, monkeypatch: py
 def test_a_world_models_card_tells_its_calibration(world: Path, tmp_path: Path) -> None:
     write_json(tmp_path / "metrics.json", {"world_model": {"name": "world", "coverage_90": 0.896319}})
     text = model_card(world, report=tmp_path / "metrics.json")
-    assert "## Calibration\n\n| | |\n|---|---|\n| coverage_90 | 0.8963 |" in text
+    assert "## Calibration\n\n| | | |\n|---|---|---|\n| coverage_90 | 0.8963 | share of outcomes in its 90 %" in text
     assert "## Data\n\nNot recorded beside this model." in text
     assert front(text)["license"] == "unknown" and "ask whoever trained it" in text
+
+
+def test_what_a_card_explains_stands_in_the_glossary() -> None:
+    glossary = (ROOT / "docs/metrics.md").read_text()
+    explained = POLICY_MEANS | MODEL_MEANS | DATA_MEANS
+    # a mean's name stands there, and `…_std` or `…_max` beside it
+    stems = {re.sub("_(std|max)$", "_mean", name) for name in explained}
+    assert [name for name in stems if not re.search(rf"\b{re.escape(name)}\b", glossary)] == []
+    means = [*DATA_MEANS.values(), *POLICY_MEANS.values(), *MODEL_MEANS.values()]
+    assert [text for text in means if "|" in text or text != text.strip()] == []
 
 
 def test_a_card_takes_no_markup_from_a_report(policy: Path, tmp_path: Path) -> None:
