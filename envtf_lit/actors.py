@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, ClassVar, TypedDict, Unpack, cast, overload
 
@@ -36,6 +36,21 @@ def in_fp32(layer: nn.Module, x: Tensor) -> Tensor:
     """
     with torch.autocast(x.device.type, enabled=False):
         return layer(x.float())
+
+
+def in_kind(
+    act: Callable[[Tensor], Tensor], observation: Tensor | ArrayLike, device: torch.device
+) -> Tensor | np.ndarray:
+    """Actions for what was seen: a tensor of its precision for a tensor, an array (float32) for an array or lists.
+
+    Args:
+        act: of tensors in single precision or less.
+        observation: what was seen.
+        device: where arrays and lists are looked at.
+    """
+    if not isinstance(observation, Tensor):
+        return act(torch.from_numpy(np.array(observation, np.float32)).to(device)).cpu().numpy()
+    return act(observation.float()).double() if observation.dtype == torch.float64 else act(observation)
 
 
 class Sizes(TypedDict, total=False):
@@ -169,14 +184,9 @@ class Actor(nn.Module, ABC):
         Raises:
             UserError: it is not as wide as the actor's observations.
         """
-        given = observation
-        if not isinstance(given, Tensor):
-            given = torch.as_tensor(np.asarray(given, np.float32), device=self.observation_mean.device)
         with torch.no_grad():
-            action = self._act(given.float() if given.dtype == torch.float64 else given, deterministic, generator)
-        if not isinstance(observation, Tensor):
-            return action.cpu().numpy()
-        return action.double() if given.dtype == torch.float64 else action
+            act = lambda given: self._act(given, deterministic, generator)  # noqa: E731
+            return in_kind(act, observation, self.observation_mean.device)
 
     @abstractmethod
     def _act(self, observation: Tensor, deterministic: bool, generator: torch.Generator | None) -> Tensor:

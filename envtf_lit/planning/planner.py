@@ -3,11 +3,14 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar, overload
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from envtf_lit.actors import in_kind
 from envtf_lit.errors import UserError
 from envtf_lit.options.schema import build
 from envtf_lit.planning.objective import Objective, Reward, Rule, Value
@@ -110,9 +113,23 @@ class Planner(ABC, Generic[Own]):
         self._left: Tensor | None = None  # (B, H, A) what the plan before has left
         self.generators.clear()
 
+    @overload
+    def act(
+        self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None
+    ) -> Tensor: ...
+
+    @overload
+    def act(
+        self, observation: ArrayLike, deterministic: bool = True, generator: torch.Generator | None = None
+    ) -> np.ndarray: ...
+
     @torch.no_grad()
-    def act(self, observation: Tensor, deterministic: bool = True, generator: torch.Generator | None = None) -> Tensor:
+    def act(
+        self, observation: Tensor | ArrayLike, deterministic: bool = True, generator: torch.Generator | None = None
+    ) -> Tensor | np.ndarray:
         """Observations (B, S), the next ones of B episodes, to the first actions (B, A) of new plans.
+
+        One observation (S,) gives one action (A,), and arrays and lists give arrays, as in `Actor.act`.
 
         Args:
             observation: of as many episodes as since the last `reset`.
@@ -123,6 +140,14 @@ class Planner(ABC, Generic[Own]):
             UserError: another number or size of observations, a state that no candidate leaves with a finite return, a
                 novelty limit where the model has no epistemic variance, or nothing to choose plans by.
         """
+
+        def first(rows: Tensor) -> Tensor:
+            return self._first(rows, deterministic, generator) if rows.dim() != 1 else first(rows[None])[0]
+
+        return in_kind(first, observation, self.middle.device)
+
+    def _first(self, observation: Tensor, deterministic: bool, generator: torch.Generator | None) -> Tensor:
+        """See `act`."""
         generator = self._own_generator(observation.device) if generator is None else generator
         found = self.search(observation, generator)
         self._left = torch.cat([found.taken[:, 1:], torch.zeros_like(found.taken[:, :1])], 1)

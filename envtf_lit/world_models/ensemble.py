@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from envtf_lit.errors import UserError
-from envtf_lit.world_models.interface import Mode, Prediction
+from envtf_lit.world_models.interface import Mode, Prediction, as_histories, as_rows
 from envtf_lit.world_models.normaliser import Normaliser
 from envtf_lit.world_models.objectives import nll
 from envtf_lit.world_models.uncertainty.laplace import OUTSIDE, quantile
@@ -159,36 +160,53 @@ class EnsembleDynamics(nn.Module):
 
     def init(
         self,
-        observations: Tensor,
-        actions: Tensor,
-        lengths: Tensor,
+        observations: Tensor | ArrayLike,
+        actions: Tensor | ArrayLike,
+        lengths: Tensor | ArrayLike,
         window: Tensor | None = None,
         *,
         posterior: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> EnsembleState:
-        """See `WorldModel.init`. Of the histories only the current observation counts."""
-        B = len(lengths)
-        window = torch.arange(B, device=lengths.device) if window is None else window
+        """See `WorldModel.init`; arrays and lists will do, too. Of the histories only the current observation counts.
+
+        Raises:
+            UserError: as of `as_histories`.
+        """
+        given = observations, actions, lengths, window
+        sizes, device = (self.observation_dim, self.action_dim), self.limit.device
+        observations, _, lengths, window = as_histories(*given, sizes, device)
         current = observations[window, lengths - 1]
         if posterior <= 0:
             return EnsembleState(current)
         if len(self.elite) == 1:
             raise UserError("This world model has no posterior to draw from, since one member predicts alone.")
-        return EnsembleState(current, self._draw(B, generator), posterior)
+        return EnsembleState(current, self._draw(len(lengths), generator), posterior)
 
     def _draw(self, count: int, generator: torch.Generator | None) -> Tensor:
         return self.elite.new_empty(count).random_(len(self.elite), generator=generator)
 
     def step(
-        self, state: EnsembleState, action: Tensor, *, mode: Mode = "mean", generator: torch.Generator | None = None
+        self,
+        state: EnsembleState,
+        action: Tensor | ArrayLike,
+        *,
+        mode: Mode = "mean",
+        generator: torch.Generator | None = None,
     ) -> tuple[EnsembleState, Prediction]:
-        """See `WorldModel.step`. A sample follows one elite, drawn for each row at each step unless the row has one."""
+        """See `WorldModel.step`; an array or a list will do, too.
+
+        A sample follows one elite, drawn for each row at each step unless the row has one.
+
+        Raises:
+            UserError: the actions have another shape than (B, A).
+        """
+        rows = as_rows("actions", action, (len(state.observation), self.action_dim), state.observation.device)
 
         def value(means: Tensor, log_variances: Tensor) -> Tensor:
             return self._value(state, means, log_variances, mode, generator)
 
-        prediction = self.predict(state.observation, action, value)
+        prediction = self.predict(state.observation, rows, value)
         return replace(state, observation=prediction.observation), prediction
 
     def predict(self, observation: Tensor, action: Tensor, value: Callable[[Tensor, Tensor], Tensor]) -> Prediction:
@@ -254,9 +272,14 @@ class EnsembleDynamics(nn.Module):
         """Lets `step` run through torch.compile from now on."""
         self.step = torch.compile(self.step, dynamic=True)  # the number of rows changes
 
-    def observe(self, state: EnsembleState, observation: Tensor) -> EnsembleState:
-        """See `WorldModel.observe`."""
-        return replace(state, observation=observation)
+    def observe(self, state: EnsembleState, observation: Tensor | ArrayLike) -> EnsembleState:
+        """See `WorldModel.observe`; an array or a list will do, too.
+
+        Raises:
+            UserError: it has another shape than (B, S).
+        """
+        now = state.observation
+        return replace(state, observation=as_rows("observations", observation, (*now.shape,), now.device))
 
     def current(self, state: EnsembleState) -> Tensor:
         """See `WorldModel.current`."""

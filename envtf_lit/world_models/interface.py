@@ -3,8 +3,12 @@
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
+
+from envtf_lit.errors import UserError
 
 Mode = Literal["mean", "sample"]
 
@@ -103,3 +107,74 @@ class WorldModel(Protocol):
         For rollouts that are carried on from a history of their own. `former` may have been consumed.
         """
         ...
+
+
+def as_rows(what: str, given: Tensor | ArrayLike, shape: tuple[int | None, ...], device: torch.device) -> Tensor:
+    """What a world model was given, as a tensor of numbers in single precision or less.
+
+    Args:
+        what: observations or actions.
+        given: a tensor, which stays where it lies; an array or lists of numbers are copied.
+        shape: that it must have; None where any size will do.
+        device: of what is copied.
+
+    Raises:
+        UserError: it has another shape, or is no numbers.
+    """
+    if not isinstance(given, Tensor):
+        try:
+            given = torch.from_numpy(np.array(given, np.float32)).to(device)
+        except (TypeError, ValueError):
+            raise UserError(
+                f"The world model was given {what} that make no array of numbers: give rows of equal length."
+            ) from None
+    if given.dtype == torch.float64 or not given.is_floating_point():
+        given = given.float()
+    if given.dim() != len(shape) or any(
+        asked is not None and size != asked for size, asked in zip(given.shape, shape, strict=True)
+    ):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        lone = given.dim() == len(shape) - 1
+        cure = "the first axis is of robots, so give a single one's as [x]" if lone else "give as many numbers"
+        raise UserError(
+            f"The world model takes {what} of shape ({wanted}) here, and was given {tuple(given.shape)}: {cure}."
+        )
+    return given
+
+
+def as_histories(
+    observations: Tensor | ArrayLike,
+    actions: Tensor | ArrayLike,
+    lengths: Tensor | ArrayLike,
+    window: Tensor | None,
+    sizes: tuple[int, int],
+    device: torch.device,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Observations, actions, lengths and windows of `WorldModel.init`, as tensors that fit each other.
+
+    Args:
+        observations, actions, lengths, window: see there.
+        sizes: S and A.
+        device: of what is no tensor yet.
+
+    Raises:
+        UserError: they do not fit each other, or a length is none of its window's.
+    """
+    observations = as_rows("observations", observations, (None, None, sizes[0]), device)
+    W, T = observations.shape[:2]
+    actions = as_rows("actions between them", actions, (W, T - 1, sizes[1]), device)
+    if not isinstance(lengths, Tensor):
+        lengths = torch.from_numpy(np.array(lengths, np.int64)).to(device)
+    window = torch.arange(W, device=lengths.device) if window is None else window
+    if lengths.shape != window.shape:
+        raise UserError(
+            f"The world model was given {tuple(lengths.shape)} lengths for {len(window)} rollouts: give one number for "
+            "each, how many of its observations it has seen."
+        )
+    on_cpu = lengths.device.type == "cpu"  # elsewhere to look would be to wait
+    if on_cpu and not ((lengths >= 1) & (lengths <= T)).all():
+        raise UserError(
+            f"The world model was given histories of {lengths.tolist()} observations, and its windows have {T}: a "
+            f"rollout has seen from 1, the present one, to {T}."
+        )
+    return observations, actions, lengths, window

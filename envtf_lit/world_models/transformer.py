@@ -13,6 +13,7 @@ from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -20,7 +21,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.world_models.attention import Block, rotation, window_mask
 from envtf_lit.world_models.cache import TransformerState
 from envtf_lit.world_models.forecast import Trajectories, forecast
-from envtf_lit.world_models.interface import Mode, Prediction
+from envtf_lit.world_models.interface import Mode, Prediction, as_histories, as_rows
 from envtf_lit.world_models.normaliser import Normaliser
 from envtf_lit.world_models.objectives import beta_nll, nll, paper_mse
 from envtf_lit.world_models.options import ModelOptions
@@ -203,18 +204,25 @@ class EnvironmentTransformer(nn.Module):
 
     def init(
         self,
-        observations: Tensor,
-        actions: Tensor,
-        lengths: Tensor,
+        observations: Tensor | ArrayLike,
+        actions: Tensor | ArrayLike,
+        lengths: Tensor | ArrayLike,
         window: Tensor | None = None,
         *,
         posterior: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> TransformerState:
-        """See `WorldModel.init`. One causal pass over the windows serves all rollouts that begin in them."""
-        B = len(lengths)
-        window = torch.arange(B, device=lengths.device) if window is None else window
-        drawn = posterior * self._posterior().draw(B, generator) if posterior > 0 else None
+        """See `WorldModel.init`; arrays and lists will do, too.
+
+        One causal pass over the windows serves all rollouts that begin in them.
+
+        Raises:
+            UserError: as of `as_histories`.
+        """
+        given = observations, actions, lengths, window
+        sizes, device = (self.observation_dim, self.action_dim), self.tail.device
+        observations, actions, lengths, window = as_histories(*given, sizes, device)
+        drawn = posterior * self._posterior().draw(len(lengths), generator) if posterior > 0 else None
         state = TransformerState.empty(self.options, observations[window, lengths - 1], drawn)
         if observations.shape[1] == 1 or self.options.context == 1:
             return state
@@ -224,12 +232,19 @@ class EnvironmentTransformer(nn.Module):
     def step(
         self,
         state: TransformerState,
-        action: Tensor,
+        action: Tensor | ArrayLike,
         *,
         mode: Mode = "mean",
         generator: torch.Generator | None = None,
     ) -> tuple[TransformerState, Prediction]:
-        """See `WorldModel.step`. One token per call; the cache is written in place unless gradients are needed."""
+        """See `WorldModel.step`; an array or a list will do, too.
+
+        One token per call; the cache is written in place unless gradients are needed.
+
+        Raises:
+            UserError: the actions have another shape than (B, A).
+        """
+        action = as_rows("actions", action, (len(state.observation), self.action_dim), state.observation.device)
         token = self.normaliser.token(state.observation, action)
         x = self.embed(token)  # (B, D)
         mask = state.visible()
@@ -242,9 +257,14 @@ class EnvironmentTransformer(nn.Module):
         prediction = self.predict(*last, state.drawn, mode=mode, generator=generator)
         return TransformerState(cache, state.clock + 1, state.first, prediction.observation, state.drawn), prediction
 
-    def observe(self, state: TransformerState, observation: Tensor) -> TransformerState:
-        """See `WorldModel.observe`."""
-        return replace(state, observation=observation)
+    def observe(self, state: TransformerState, observation: Tensor | ArrayLike) -> TransformerState:
+        """See `WorldModel.observe`; an array or a list will do, too.
+
+        Raises:
+            UserError: it has another shape than (B, S).
+        """
+        now = state.observation
+        return replace(state, observation=as_rows("observations", observation, (*now.shape,), now.device))
 
     def current(self, state: TransformerState) -> Tensor:
         """See `WorldModel.current`."""
