@@ -16,8 +16,8 @@ class CommonOptions:
     """What all policies share, so that they are compared with equal budgets, networks and rows.
 
     Attributes:
-        updates: gradient steps in all, the warm start included.
-        updates_per_epoch: gradient steps between two log lines (and resumable checkpoints).
+        updates: gradient steps in all, the warm start included; a multiple of `updates_per_epoch`.
+        updates_per_epoch: gradient steps between two log lines and resumable checkpoints, a multiple of 10.
         batch_size: rows per gradient step.
         hidden: units of each hidden layer of actor and critics.
         layer_norm: LayerNorm in the critics.

@@ -48,7 +48,7 @@ class TransformerOptions(ModelOptions):
     """The Environment Transformer and how it is trained.
 
     Attributes:
-        updates: gradient steps in all.
+        updates: gradient steps in all, a multiple of `updates_per_epoch`.
         updates_per_epoch: gradient steps between two validations (and resumable checkpoints).
         batch_size: windows of `context` steps per gradient step.
         learning_rate: peak, reached after `warmup` of the updates, then a cosine to zero.
@@ -94,7 +94,7 @@ class EnsembleOptions:
         members: networks, each trained on a bootstrap resample of its own.
         elites: members of least held-out error, the ones that predict.
         hidden: units of each hidden layer.
-        updates: gradient steps at most.
+        updates: gradient steps at most, a multiple of `updates_per_epoch`.
         updates_per_epoch: gradient steps between two validations (and resumable checkpoints).
         batch_size: rows per gradient step and member.
         learning_rate: Adam's.
