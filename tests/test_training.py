@@ -287,8 +287,9 @@ def test_policies_imagine_no_further_than_the_model_reaches(imagined, capsys):
         assert list(cut.path_lengths.values()) == [expansion, horizon]
         note = capsys.readouterr().err
         assert note.endswith(
-            f"reaches {steps} steps before its error passes 0.1 (open_loop_0.1_median): rollouts.value_expansion is "
-            f"{expansion}, not 50 and value_gradient.horizon is {horizon}, not 16.\n"
+            f"reaches {steps} step{'' if steps == 1 else 's'} before its error passes 0.1 (open_loop_0.1_median), so "
+            f"paths are shortened: rollouts.value_expansion is {expansion}, not 50 and value_gradient.horizon is "
+            f"{horizon}, not 16; for longer ones train the model on more updates or more data.\n"
         ) is (steps < 50) and (note == "") is (steps > 50)
     metrics = {
         name: value for name, value in read_json(model / "metrics.json").items() if name != "open_loop_0.1_median"

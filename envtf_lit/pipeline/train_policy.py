@@ -113,7 +113,10 @@ def within_reach(options: MixingOptions, model: Path) -> MixingOptions:
         return options
     asked, now = options.path_lengths, cut.path_lengths
     changes = [f"{name} is {now[name]}, not {length}" for name, length in asked.items() if now[name] != length]
-    note(f"{model} reaches {steps} steps before its error passes 0.1 ({REACH}): {' and '.join(changes)}.")
+    note(
+        f"{model} reaches {steps} step{'s' * (steps != 1)} before its error passes 0.1 ({REACH}), so paths are "
+        f"shortened: {' and '.join(changes)}; for longer ones train the model on more updates or more data."
+    )
     return cut
 
 
