@@ -5,7 +5,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from envtf_lit.cli.main import main
 from envtf_lit.critics import Critics, load_critics, save_critics
 from envtf_lit.data.sources.files import save_dataset
 from envtf_lit.errors import UserError
-from envtf_lit.evaluation.planning import planner_of, score_planner
+from envtf_lit.evaluation.planning import planner_of, robot_to_plan_for, score_planner
 from envtf_lit.planning.objective import imagined_paths
 from envtf_lit.planning.pendulum import TruePendulum
 from envtf_lit.policy import PredictingPolicy, save_policy
@@ -33,6 +33,7 @@ from envtf_lit.studies.planning import (
     watch,
 )
 from envtf_lit.world_models.store import load_world_model, save_world_model
+from envtf_lit.world_models.termination_head import TerminationHead, save_termination
 from envtf_lit.world_models.transformer import EnvironmentTransformer
 from tests.logs import dataset_of_chains
 from tests.test_planning import SMALL
@@ -120,6 +121,7 @@ def test_a_plan_is_worth_what_it_pays_and_the_value_of_its_end(hopper_model: Pat
         (["--task", "walker2d-medium"], "observations of size 11.*walker2d has 17 and 6"),
         (["--world-model", "nowhere"], "nowhere"),
         (["--video", "x.gif"], "name them with --dataset"),
+        (["--task", "Hoper-v5"], "no environment 'Hoper-v5': did you mean 'Hopper-v5'"),
         (["--planner", "mpi"], "did you mean 'mppi'"),
     ],
 )
@@ -130,6 +132,56 @@ def test_envtf_plan_refuses_in_one_sentence(
         main(envtf_plan(hopper_model, *words))
     assert stop.value.code == 2
     assert re.search(sentence, capsys.readouterr().err)
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """A robot of one's own, of four numbers and two unequal actuators: a log, its world model and a policy."""
+    torch.manual_seed(0)
+    limits = dict(action_low=np.array([-2, -1], np.float32), action_high=np.array([1, 3], np.float32))
+    log = replace(dataset_of_chains(), **limits)
+    save_dataset(log.with_split(0.3, 0), tmp_path / "log.h5")
+    model = EnvironmentTransformer(4, 2, layers=1, heads=1, width=8, context=2)
+    model.normaliser.target_mean[-1] = 0.5  # rewards that differ: else no plan is better than another
+    save_world_model(tmp_path / "model", model)
+    save_policy(tmp_path / "policy", TanhGaussianActor(4, 2, hidden=(8,), action_low=[-2, -1], action_high=[1, 3]))
+    return tmp_path
+
+
+def test_envtf_plan_plays_in_the_model_where_there_is_no_simulator(own: Path, capsys: pytest.CaptureFixture[str]):
+    words = ["--dataset", str(own / "log.h5"), "--policy", str(own / "policy"), "--out", str(own / "plan.json")]
+    few = ["--option", "horizon=2", "--option", "samples=4", "--episodes", "2", "--quiet", "--threads", "1"]
+    main(["plan", "--world-model", str(own / "model"), *words, *few])
+    said = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"imagined return score steps.* mppi -?[\d.]+ – [1-4] .* policy -?[\d.]+ – [1-4] ", said)
+    assert "opinion, which nobody measured" in said
+    found = json.loads((own / "plan.json").read_text())
+    assert found["task"] is None and len(found["returns"]) == len(found["prior_returns"]) == 2
+
+
+def test_a_robot_without_a_simulator_is_planned_for_within_its_own_range_by_the_rule_of_its_log(own: Path):
+    head = TerminationHead(4)
+    torch.nn.init.constant_(cast(torch.nn.Linear, head.layers[-1]).bias, 9.0)  # to it, all states are falls
+    save_termination(own / "model/termination", head)
+    robot = robot_to_plan_for(own / "model", None, own / "log.h5")
+    assert robot.max_episode_steps == 4 and robot.terminated(torch.zeros(1, 4)).all()
+    planner = planner_of("random", load_world_model(own / "model"), robot, ["horizon=1", "samples=100"])
+    first = planner.scaled(planner.search(torch.zeros(1, 4)).candidates)[0, :, 0]
+    assert first.amin(0).tolist() == pytest.approx([-2, -1], abs=0.3)
+    assert first.amax(0).tolist() == pytest.approx([1, 3], abs=0.3)
+    played = score_planner(
+        own / "model", robot, "random", ["horizon=1"], episodes=1, seed=0, steps=None, progress=False
+    )
+    assert played.planned.lengths.tolist() == [1]
+
+
+def test_envtf_plan_plays_in_any_environment_of_gymnasium(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    model = EnvironmentTransformer(3, 1, layers=1, heads=1, width=8, context=2)
+    model.normaliser.target_mean[-1] = 0.5
+    save_world_model(tmp_path / "model", model)
+    few = ["--option", "horizon=2", "--option", "samples=4", "--steps", "3", "--quiet", "--threads", "1"]
+    main(["plan", "--world-model", str(tmp_path / "model"), "--task", "Pendulum-v1", *few])
+    assert re.search(r"mppi +-[\d.]+ +– +3 ", capsys.readouterr().out)
 
 
 def test_a_policy_of_another_robot_is_refused(hopper_model: Path, tmp_path: Path):

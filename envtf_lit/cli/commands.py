@@ -80,7 +80,7 @@ COMMANDS = {
         "The same command goes on with the runs that are not finished.",
     ),
     "compare report": Command("comparison", "Write tables and figures of what compare run has found"),
-    "plan": Command("planning", "Play a planner in MuJoCo: it searches a world model at every step"),
+    "plan": Command("planning", "Play a planner, which searches a world model at each step, in MuJoCo or the model"),
     "export policy": Command("export", "Write a policy as ONNX or torch.export: observation to action"),
     "export model": Command(
         "export", "Write a world model's step as ONNX or torch.export, its cache an input and output"

@@ -1,8 +1,9 @@
 """`envtf plan` and `envtf bench planning`: planners that act through a world model."""
 
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from envtf_lit.cli.output import console, hush_lightning
 from envtf_lit.cli.signatures import CORES, File, Folder, Natural, Positive, run_command
@@ -15,76 +16,96 @@ if TYPE_CHECKING:
 Options = Annotated[tuple[str, ...], "NAME=VALUE"]
 
 
+@dataclass(frozen=True)
+class Episodes:
+    """The episodes that a planner plays, and beside it the policy that it begins at.
+
+    Attributes:
+        episodes: of each.
+        steps: of an episode at most; default: as many as the robot's have, or the log's longest.
+        seed: of everything random.
+        precision: of matrix products while it plans.
+    """
+
+    episodes: Positive = 1
+    steps: Positive | None = None
+    seed: Natural = 0
+    precision: Literal["fp32", "bf16"] = "fp32"
+
+
 def plan(
     *,
     world_model: Folder,
-    task: Annotated[str, "TASK"],
+    task: Annotated[str, "TASK"] | None = None,
+    dataset: File | None = None,
     planner: Literal["random", "cem", "icem", "mppi", "gradient"] = "mppi",
     policy: Folder | None = None,
     no_critics: bool = False,
     option: Options = (),
-    episodes: Positive = 1,
-    steps: Positive | None = None,
-    seed: Natural = 0,
+    played: Episodes = Episodes(),
     threads: Positive = CORES,
-    precision: Literal["fp32", "bf16"] = "fp32",
     out: File | None = None,
     video: File | None = None,
-    dataset: File | None = None,
     quiet: bool = False,
 ) -> None:
-    """Plays a planner in MuJoCo.
+    """Plays a planner, in a simulator or in the world model itself.
 
     Args:
         world_model: that it plans through.
-        task: whose robot acts, such as hopper-medium.
+        task: whose simulator it plays in, such as hopper-medium, or a Gymnasium id such as Pendulum-v1. Without one it
+            plays in the world model, from where the episodes of --dataset begin, and returns are the model's opinion.
+        dataset: that the model was trained on; in its units a video tells the error.
         planner: family.
         policy: whose plan the search begins at, and whose critics, where its folder has some, judge what follows a
             plan, with their own discount; it is played beside the planner.
         no_critics: nothing follows a plan, whatever the policy's folder has.
         option: of the planner, such as horizon=20; may be repeated.
-        episodes: of each.
-        steps: of an episode at most; default: the robot's 1000.
-        seed: of everything random.
+        played: by each.
         threads: CPU threads.
-        precision: of matrix products while it plans.
         out: JSON.
-        video: GIF of the median episode, beside what the model imagines of the same actions; needs --dataset.
-        dataset: that the model was trained on, in whose units the video tells the error.
+        video: GIF of the median episode in MuJoCo, beside what the model imagines of the same actions; needs --dataset.
         quiet: no progress bar.
 
     Raises:
-        UserError: a video without a dataset.
+        UserError: neither task nor dataset, or a video without both.
     """
-    if video is not None and dataset is None:
-        raise UserError("--video tells the model's error in units of its data: name them with --dataset FILE.")
+    _check_places(task, dataset, video)
     import torch
 
-    from envtf_lit.evaluation.planning import score_planner
-    from envtf_lit.files import write_json
+    from envtf_lit.evaluation.planning import robot_to_plan_for, score_planner
     from envtf_lit.results import claim
-    from envtf_lit.robots.tasks import get_task
 
     if out is not None:
         claim(out, "decisions_per_second")
     torch.set_num_threads(threads)
-    robot = get_task(task).robot
-    played: dict[str, Any] = dict(
-        policy=policy,
-        critics=not no_critics,
-        episodes=episodes,
-        steps=steps,
-        seed=seed,
-        precision=precision,
-        progress=not quiet,
-    )
-    found = score_planner(world_model, robot, planner, option, **played)
-    _print_scores(found, planner, policy)
+    robot = robot_to_plan_for(world_model, task, dataset, steps=played.steps)
+    wishes = dict(policy=policy, critics=not no_critics, progress=not quiet)
+    found = score_planner(world_model, robot, planner, option, **asdict(played), **wishes)
+    _print_scores(found, planner, policy, imagined=task is None)
     if out is not None:
-        asked = dict(task=task, planner=planner, options=list(option), seed=seed, threads=threads, precision=precision)
-        write_json(out, asked | _rates(found))
+        asked = dict(task=task, planner=planner, options=list(option), seed=played.seed, threads=threads)
+        _write(out, asked | dict(precision=played.precision), found)
     if video is not None and dataset is not None:
         _draw(found, world_model, robot, dataset, video)
+
+
+def _check_places(task: str | None, dataset: Path | None, video: Path | None) -> None:
+    """Something to play in, and to draw, is named."""
+    if task is None and dataset is None:
+        raise UserError(
+            "A planner plays in a simulator or in the world model: name a --task, such as hopper-medium, or, of a "
+            "robot of your own, the log that its model was trained on: --dataset FILE."
+        )
+    if video is not None and dataset is None:
+        raise UserError("--video tells the model's error in units of its data: name them with --dataset FILE.")
+    if video is not None and task is None:
+        raise UserError("--video shows MuJoCo beside the model: name a --task whose robot it draws.")
+
+
+def _write(out: Path, asked: dict[str, object], found: "PlannedReturns") -> None:
+    from envtf_lit.files import write_json
+
+    write_json(out, asked | _rates(found))
 
 
 def _rates(found: "PlannedReturns") -> dict[str, object]:
@@ -93,26 +114,35 @@ def _rates(found: "PlannedReturns") -> dict[str, object]:
     return rates | {"discount": found.discount, "critics": found.valued} | prior
 
 
-def _print_scores(found: "PlannedReturns", planner: str, policy: Path | None) -> None:
+def _print_scores(found: "PlannedReturns", planner: str, policy: Path | None, *, imagined: bool) -> None:
     from rich.table import Table
 
-    table = Table("", "return", "score", "steps", "decisions/s", box=None)
+    table = Table("", "imagined return" if imagined else "return", "score", "steps", "decisions/s", box=None)
     rate = f"{found.decisions_per_second:.1f}"
     for name, played, speed in ((planner, found.planned, rate), (policy.name if policy else "", found.prior, "")):
         if played is not None:
-            row = played.returns.mean(), played.scores.mean(), played.lengths.mean()
-            table.add_row(name, f"{row[0]:.1f}", f"{row[1]:.1f}", f"{row[2]:.0f}", speed)
+            score = played.scores.mean()
+            known = f"{score:.1f}" if score == score else "–"  # NaN of a robot without references
+            table.add_row(name, f"{played.returns.mean():.1f}", known, f"{played.lengths.mean():.0f}", speed)
     console().print(table, soft_wrap=False)
     after = f"{policy}'s critics judge what follows a plan" if found.valued else "Nothing follows a plan"
     console().print(f"{after}; discount {found.discount:g}.")
+    if imagined:
+        console().print(
+            "Imagined returns are the world model's opinion, which nobody measured; an episode ends early where the "
+            "robot falls, or where the model no longer knows."
+        )
 
 
 def _draw(found: "PlannedReturns", world_model: Path, robot: "Robot", dataset: Path, video: Path) -> None:
     from envtf_lit.data.sources.files import load_dataset
     from envtf_lit.figures.video import real_vs_imagined
+    from envtf_lit.robots.tasks import ROBOTS
     from envtf_lit.world_models.forecast import Scale
     from envtf_lit.world_models.store import load_world_model
 
+    if robot.name not in ROBOTS:
+        raise UserError(f"--video draws the robots of the tasks, and {robot.name} is none of them: leave it out.")
     scale = Scale.of(load_dataset(dataset))
     real_vs_imagined(load_world_model(world_model), found.planned.median, robot, scale, video)
 

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,19 @@ from torch import Tensor
 
 from envtf_lit.critics import CRITICS, PolicyCritics, load_critics
 from envtf_lit.errors import UserError
+from envtf_lit.imagination.dream import Dream, DreamOptions
 from envtf_lit.options.schema import Precision, build
 from envtf_lit.planning.planner import Planner
 from envtf_lit.planning.registry import PLANNERS
 from envtf_lit.policy import Policy, load_policy
+from envtf_lit.registration import ENV_ID
+from envtf_lit.robots.environments import action_limits, robot_in
 from envtf_lit.robots.returns import Returns, evaluate_policy
-from envtf_lit.robots.tasks import Robot
+from envtf_lit.robots.tasks import ROBOTS, Robot
 from envtf_lit.training import autocast
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.store import load_world_model
+from envtf_lit.world_models.termination_head import termination_rule
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +69,47 @@ class Timed:
         return action
 
 
+def robot_to_plan_for(
+    world_model: Path, task: str | None, dataset: Path | None = None, *, steps: int | None = None
+) -> Robot:
+    """A robot with an environment to play in: its simulator, or, without a task, the world model that is planned in.
+
+    Episodes in the model begin where the log's do, and end where a robot falls, by its rule or by the one learned from
+    the log, or where the model no longer knows.
+
+    Args:
+        world_model: folder.
+        task: of ours, or the id of a Gymnasium environment, of which no rule is known but what the model learned.
+        dataset: log; needed without a task.
+        steps: of an episode in the model at most; None: of the log's longest.
+
+    Raises:
+        UserError: there is no such environment, or as of `Dream`.
+    """
+    if task is not None:
+        robot = robot_in(task)
+        return robot if robot.name in ROBOTS else replace(robot, terminated=_learned_rule(world_model))
+    dream = Dream(world_model, dataset, options=DreamOptions(starts="episodes"))
+    if dream.dataset is None:
+        raise UserError("Without a task a planner plays in the world model, from states of its log: give the dataset.")
+    longest = int(dream.dataset.episode_lengths.max()) if steps is None else steps
+    return Robot(
+        "the log's robot",
+        ENV_ID,
+        dream.model.observation_dim,
+        dream.model.action_dim,
+        return_random=float("nan"),
+        return_expert=float("nan"),
+        terminated=dream.terminated,
+        env_kwargs=dict(world_model=world_model, dataset=dream.dataset, starts="episodes", max_steps=longest),
+        max_episode_steps=longest,
+    )
+
+
+def _learned_rule(world_model: Path) -> Callable[[Tensor], Tensor]:
+    return termination_rule(None, world_model, torch.device("cpu"))
+
+
 def planner_of(
     name: str,
     model: WorldModel,
@@ -95,12 +140,12 @@ def planner_of(
             f"and {robot.name}{robot.variant} has {robot.observation_dim} and {robot.action_dim}: take a model that "
             "was trained on this robot."
         )
-    cls, limit = PLANNERS[name], [robot.action_limit] * robot.action_dim
+    cls, (low, high) = PLANNERS[name], action_limits(robot)
     common = {} if critics is None else {"discount": critics.critics.discount}
     options = build(cls.Options, common | dict(_assignment(word) for word in words), "")
     value = None if critics is None else critics.value
     further = dict(terminated=robot.terminated, value=value, prior=prior, seed=seed)
-    return cls(model, [-x for x in limit], limit, options, **further)  # pyright: ignore[reportArgumentType]
+    return cls(model, low.tolist(), high.tolist(), options, **further)  # pyright: ignore[reportArgumentType]
 
 
 def _assignment(word: str) -> tuple[str, Any]:
@@ -128,11 +173,11 @@ def score_planner(
     precision: Precision = "fp32",
     progress: bool = True,
 ) -> PlannedReturns:
-    """Plays a planner in MuJoCo, and beside it the policy that it starts from.
+    """Plays a planner in a robot's environment, and beside it the policy that it starts from.
 
     Args:
         world_model: folder.
-        robot: whose simulator is played in.
+        robot: as of `robot_to_plan_for`.
         planner, words: as of `planner_of`.
         policy: folder of the prior; None plans without one.
         critics: the prior's value of a plan's last state counts, where the folder has critics.
