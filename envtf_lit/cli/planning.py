@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from envtf_lit.cli.output import console, hush_lightning
 from envtf_lit.cli.signatures import CORES, File, Folder, Natural, Positive, run_command
 from envtf_lit.errors import UserError
+from envtf_lit.options.schema import Precision
 
 if TYPE_CHECKING:
     from envtf_lit.evaluation.planning import PlannedReturns
@@ -27,7 +28,7 @@ def plan(
     steps: Positive | None = None,
     seed: Natural = 0,
     threads: Positive = CORES,
-    precision: Literal["fp32", "bf16"] = "fp32",
+    precision: Precision = "fp32",
     out: File | None = None,
     video: File | None = None,
     dataset: File | None = None,

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from envtf_lit.critics import CRITICS, PolicyCritics, load_critics
+from envtf_lit.devices import autocast
 from envtf_lit.errors import UserError
 from envtf_lit.options.schema import Precision, build
 from envtf_lit.planning.planner import Planner
@@ -18,7 +19,6 @@ from envtf_lit.planning.registry import PLANNERS
 from envtf_lit.policy import Policy, load_policy
 from envtf_lit.robots.returns import Returns, evaluate_policy
 from envtf_lit.robots.tasks import Robot
-from envtf_lit.training import autocast
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.store import load_world_model
 
