@@ -49,6 +49,19 @@ def alike(rows: Batch) -> Tensor:
     return torch.ones(len(rows["returns"]))
 
 
+def learned_by_heart() -> Batch:
+    """Four rows; held-out actions are uniform."""
+    data, few = linear_data(EPISODES), torch.arange(4)
+    return dict(
+        observations=torch.as_tensor(data.observations)[few],
+        actions=torch.full((4, 1), 0.9),
+        rewards=torch.zeros(4),
+        returns=torch.arange(4.0),
+        tails=torch.zeros(4),
+        last_observations=torch.as_tensor(data.next_observations)[few],
+    )
+
+
 def watching(actor: TanhGaussianActor) -> Trust:
     trust = Trust(actor)
     trust.begin(rows_of(linear_data(EPISODES)), alike, 0, CPU)
@@ -99,18 +112,8 @@ def test_a_clone_that_explains_the_actions_is_the_first_of_a_better_kind():
 def test_the_warm_start_ends_with_the_clone_not_with_what_was_learned_by_heart(monkeypatch):
     monkeypatch.setattr(trust_module, "CHECK_EVERY", 10)
     monkeypatch.setattr(trust_module, "LEARNING_RATE", 0.03)
-    agent = hand_driven(ETCQL, source=imagined_batches(), **small())
-    data = linear_data(EPISODES)
-    few = torch.arange(4)  # rows, learned by heart; held-out actions are uniform
-    batch = dict(
-        observations=torch.as_tensor(data.observations)[few],
-        actions=torch.full((4, 1), 0.9),
-        rewards=torch.zeros(4),
-        returns=torch.zeros(4),
-        tails=torch.zeros(4),
-        last_observations=torch.as_tensor(data.next_observations)[few],
-    )
-    seen = []
+    agent = hand_driven(ETCQL, source=imagined_batches(), beta=0.0, **small())
+    batch, seen = learned_by_heart(), []
     for _ in range(54):
         agent.update(batch)
         agent.update_index += 1
@@ -143,6 +146,17 @@ def test_better_rows_are_cloned_more_where_states_leave_a_choice(determined):
     batch = dict(observations=torch.zeros(3, 3), returns=returns)
     weights = agent.row_weights(batch)
     assert bool((weights.diff() > 0).all()) is not determined and bool((weights == 1).all()) is determined
+
+
+def test_the_warm_starts_clone_is_no_distance_from_itself(monkeypatch):
+    """Its rows weighed something else when it was looked at: the values that weigh them have learned since."""
+    monkeypatch.setattr(trust_module, "CHECK_EVERY", 10)
+    monkeypatch.setattr(trust_module, "LEARNING_RATE", 0.03)
+    agent = hand_driven(ETCQL, source=imagined_batches(), **small())
+    for _ in range(54):
+        agent.update(learned_by_heart())
+        agent.update_index += 1
+    assert agent.trust.excess(agent.actor) == pytest.approx(0.0, abs=1e-6)
 
 
 # the constraint

@@ -65,6 +65,8 @@ class Trust(nn.Module):
             self.determined.fill_(True)
             self.best.fill_(math.inf)
         error = self.error(actor, self.looked_at)
+        if self.best.isfinite():  # rows may weigh something else than they did at the look before
+            self.best.copy_(self.error(self.clone, self.looked_at))
         if error < self.best:
             self.best.copy_(error)
             self.clone.load_state_dict(actor.state_dict())
