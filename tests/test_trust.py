@@ -229,6 +229,7 @@ def test_a_promise_is_the_mean_return_of_whole_imagined_episodes():
         returns.append(total)
     assert abs(found.mean - sum(returns) / 2) < 4 * found.error
     assert found.error == pytest.approx(abs(returns[0] - returns[1]) / 2 / math.sqrt(300), rel=0.05)
+    assert (found.low, found.high) == pytest.approx((min(returns), max(returns)), abs=1.0)
     assert found.lost == 0.0 and found.steps == 40.0
 
 
@@ -274,7 +275,7 @@ def test_the_log_is_left_for_a_clear_gain_alone(promises, errors, price, kept):
     critics = [StackedCritics(3, 1, hidden=(8,), layer_norm=False) for _ in range(3)]
     frontier = Frontier(actors[0], critics[0], 4)
     for place, (mean, error) in enumerate(zip(promises, errors, strict=True)):
-        promise = Promise(mean, error, lost=0.01, steps=9.0)
+        promise = Promise(mean, error, low=0.0, high=200.0, lost=0.01, steps=9.0)
         frontier.add(actors[place], critics[place], update=place, excess=0.1 * place, promise=promise)
     chosen = frontier.choose(price)
     assert torch.equal(flat(chosen.state_dict()), flat(actors[kept].state_dict()))
