@@ -28,9 +28,9 @@ class Range:
 def promised_range(row: Mapping[str, float], held_out: Mapping[str, float]) -> Range:
     """The return that an actor of the frontier is promised, as a range: `[low - steps |b|, high + steps |b|]`.
 
-    From `low` to `high` lie the returns of nine of ten imagined episodes. Not their mean: where a robot always begins alike,
-    its episodes share one fate, and what the model takes for the fate of some may be that of all. Of 18 Hopper policies
-    16 earned what lies there, 6 what two standard errors about the mean hold.
+    From `low` to `high` lie the returns of nine of ten imagined episodes. Not their mean: where a robot always begins
+    alike, its episodes share one fate, and what the model takes for the fate of some may be that of all
+    (docs/log/trust.md: of 23 policies 21 earned what lies there, 8 what two standard errors about the mean hold).
 
     `b` is what the model errs by per step where the truth is known: of the held-out episodes, whose actions it is given
     and nothing else, the mean imagined return less the mean recorded one, divided by their steps. What an actor's
