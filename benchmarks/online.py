@@ -15,9 +15,9 @@ from typing import Any
 
 import pandas as pd
 
+from envtf_lit.devices import pick_device
 from envtf_lit.files import write_json
 from envtf_lit.studies.machine import facts
-from envtf_lit.training import pick_device
 
 QUIET = ["--trainer.logger=false", "--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
 

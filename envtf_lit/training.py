@@ -19,6 +19,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, R
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import nn
 
+from envtf_lit.devices import multiplies_bf16, pick_device, resolved
 from envtf_lit.divergence import check_epoch
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import check_writable, replacing, write_json, write_table
@@ -27,6 +28,7 @@ from envtf_lit.progress import note
 
 logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # says what hardware there is at every fit
 RUNS = Path(".envtf/runs")
+LIGHTNING: dict[str, Literal["bf16-mixed", "32-true"]] = {"bf16": "bf16-mixed", "fp32": "32-true"}  # its words
 # glibc's M_MMAP_THRESHOLD (the largest there is) and M_TRIM_THRESHOLD, in bytes: what is below them is kept
 MALLOC = {-3: 32 << 20, -1: 512 << 20}
 
@@ -150,7 +152,7 @@ def trained(
     keepers = [Guard(), *callbacks, *_keepers(run, curves, monitor, mode)]
     trainer = L.Trainer(
         max_epochs=epochs,
-        precision="bf16-mixed" if precision == "bf16" else "32-true",
+        precision=LIGHTNING[_checked(precision)],
         accelerator="auto",
         devices=1,
         callbacks=[*keepers, *([RichProgressBar()] if progress else [])],
@@ -240,18 +242,12 @@ def freeze(module: nn.Module, parts: Sequence[str]) -> None:
         raise UserError(f"Freezing {', '.join(parts)} leaves nothing to train: freeze less.")
 
 
-def pick_device() -> torch.device:
-    """The accelerator if there is one, else the CPU."""
-    if torch.accelerator.is_available():
-        accelerator = torch.accelerator.current_accelerator()
-        assert accelerator is not None
-        return accelerator
-    return torch.device("cpu")
-
-
-def autocast(device: torch.device, precision: Precision) -> torch.autocast:
-    """bf16 matrix products where the parameters ask for them."""
-    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
+def _checked(precision: Precision) -> Literal["fp32", "bf16"]:
+    """As `resolved`; says so where it will be slow."""
+    device = pick_device()
+    if precision == "bf16" and not multiplies_bf16(device):
+        note(f"bf16 is emulated on this {device.type}, many times slower than fp32: take precision: auto.")
+    return resolved(precision, device)
 
 
 def keep_freed_memory() -> None:

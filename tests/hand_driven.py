@@ -7,7 +7,7 @@ from torch import Tensor
 
 from envtf_lit.agents.phases import Batch
 from envtf_lit.agents.value_gradient import ValueGradientOptions
-from envtf_lit.data.loaders import DrawnRows
+from envtf_lit.data.loaders import DrawnRows, Transitions
 from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.options import RolloutOptions
 from envtf_lit.imagination.rollouts import Rollouts
@@ -31,7 +31,8 @@ def hand_driven(cls: type[Any], *, source: ImaginedBatches | None = None, action
     agent.clip_gradients = lambda *_, **__: None
     agent.generator, agent.update_index, agent.clones = torch.Generator().manual_seed(0), 0, True
     if agent.watches:
-        agent.trust.begin(DrawnRows(linear_data(EPISODES)), 0, torch.device("cpu"))
+        rows = DrawnRows(Transitions(linear_data(EPISODES), discount=agent.options.discount))
+        agent.trust.begin(rows, agent.held_out_weights, 0, torch.device("cpu"))
     return agent
 
 

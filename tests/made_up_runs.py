@@ -10,6 +10,7 @@ import torch
 from analytic import linear_data, linear_world
 from PIL import Image
 
+from envtf_lit.agents.trust_levels import COLUMNS
 from envtf_lit.data.cards import dataset_card
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.evaluation.horizon import horizon_report
@@ -75,9 +76,12 @@ def some_estimates() -> OfflineEstimates:
 
 def some_frontier(kept: int = 2) -> Places:
     """The clone and two actors further out, of which one is published; the last strays from what the model knows."""
-    columns = ("update", "excess", "promise", "error", "lost", "steps")
-    rows = [(0, 0.0, 310.0, 2.0, 0.001, 45.0), (200, 0.05, 350.0, 3.0, 0.002, 45.0), (400, 0.2, 420.0, 5.0, 0.03, 90.0)]
-    return [dict(zip(columns, row, strict=True)) | {"kept": float(place == kept)} for place, row in enumerate(rows)]
+    rows = [
+        (0, 0.0, 310.0, 2.0, 306.0, 314.0, 0.001, 45.0),
+        (200, 0.05, 350.0, 3.0, 344.0, 356.0, 0.002, 45.0),
+        (400, 0.2, 420.0, 5.0, 410.0, 430.0, 0.03, 90.0),
+    ]
+    return [dict(zip(COLUMNS, row, strict=True)) | {"kept": float(place == kept)} for place, row in enumerate(rows)]
 
 
 def made_up_run(root: Path, source: str = "file", *, simulator: bool = True) -> Path:

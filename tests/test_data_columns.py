@@ -15,13 +15,13 @@ from envtf_lit.data.columns import FileRows
 from envtf_lit.data.dataset import COLUMNS
 from envtf_lit.data.loaders import Store, Transitions, Windows
 from envtf_lit.data.sources.files import load_dataset, save_dataset
+from envtf_lit.devices import pick_device
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.histories import BranchPoints
 from envtf_lit.pipeline.generate_rollouts import generate_rollouts
 from envtf_lit.pipeline.train_model import train_model
 from envtf_lit.pipeline.train_policy import train_policy
 from envtf_lit.pipeline.yaml import preset_params
-from envtf_lit.training import pick_device
 
 WIDE = ("observations", "actions", "next_observations")
 

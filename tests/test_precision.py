@@ -10,6 +10,10 @@ from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.agents.cql import CQL
 from envtf_lit.agents.networks import StateValue
 from envtf_lit.critics import StackedCritics
+from envtf_lit.devices import autocast, resolved
+from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.stage import run_settings
+from envtf_lit.world_models.options import TransformerOptions
 from tests.hand_driven import B, S, hand_driven, imagination, make_batch
 
 A, PAIRS = 2, 4_096
@@ -95,3 +99,23 @@ def test_imagination_is_in_fp32():
     with bf16():
         found = imagined.rollouts(actor, torch.Generator().manual_seed(0))
     assert torch.equal(found.next_observations, exact.next_observations)
+
+
+# which precision
+
+
+@pytest.mark.parametrize(
+    ("able", "expected"), [({}, "fp32"), ({"avx512_bf16": True}, "bf16"), ({"amx_bf16": True}, "bf16")]
+)
+def test_auto_is_bf16_where_the_processor_multiplies_it(monkeypatch, able, expected) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able)
+    cpu = torch.device("cpu")
+    assert resolved("auto", cpu) == expected
+    assert (resolved("fp32", cpu), resolved("bf16", cpu)) == ("fp32", "bf16")
+    with autocast(cpu, "auto"):
+        assert torch.is_autocast_enabled("cpu") is (expected == "bf16")
+
+
+def test_what_auto_was_stands_in_a_runs_record(monkeypatch) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict)
+    assert run_settings(Params(), TransformerOptions())["precision"] == "fp32"

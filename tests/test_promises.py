@@ -27,19 +27,21 @@ from envtf_lit.files import write_table
 HELD_OUT = held_out_metrics(some_estimates())  # the model imagines 10 more than was recorded, in 45 steps
 
 
+HEADER = "update,excess,promise,error,low,high,lost,steps,kept"
+
 # the range
 
 
-def test_a_range_holds_the_models_doubt_and_its_error_on_recorded_actions_for_each_step() -> None:
+def test_a_range_holds_what_episodes_returned_and_the_models_error_on_recorded_actions_for_each_step() -> None:
     assert HELD_OUT["imagined_return_mean"] - HELD_OUT["return_mean"] == pytest.approx(10.0)
     assert HELD_OUT["steps_mean"] == 45.0
-    row = {"promise": 100.0, "error": 3.0, "steps": 90.0}
+    row = {"promise": 100.0, "error": 1.0, "low": 60.0, "high": 110.0, "steps": 90.0}
     found = promised_range(row, HELD_OUT)
-    assert (found.low, found.high) == pytest.approx((100.0 - 6.0 - 20.0, 100.0 + 6.0 + 20.0))
+    assert (found.low, found.high) == pytest.approx((60.0 - 20.0, 110.0 + 20.0))
     lower = HELD_OUT | {"imagined_return_mean": HELD_OUT["return_mean"] - 10.0}
     assert promised_range(row, lower) == found  # it may be wrong to either side
-    assert promised_range(row, HELD_OUT | {"imagined_return_mean": HELD_OUT["return_mean"]}) == Range(94.0, 106.0)
-    assert 74.0 in found and 73.9 not in found and 126.1 not in found
+    assert promised_range(row, HELD_OUT | {"imagined_return_mean": HELD_OUT["return_mean"]}) == Range(60.0, 110.0)
+    assert 40.0 in found and 39.9 not in found and 130.1 not in found
 
 
 # the frontier on disk
@@ -55,10 +57,10 @@ def test_a_frontier_is_read_as_it_was_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "it has no error and no excess"),
-        ("update,excess,promise,error,lost,kept\n0,0,1,1,0,1\n", "it has no steps"),
-        ("update,excess,promise,error,lost,steps,kept\n0,0,1,1,0,9,0\n", "does not name one actor as kept"),
-        ("update,excess,promise,error,lost,steps,kept\n0,,1,1,0,9,1\n", "does not name one actor as kept"),
+        ("", "it has no error and no excess and no high and no kept"),
+        ("update,excess,promise,error,low,high,lost,kept\n0,0,1,1,0,2,0,1\n", "it has no steps"),
+        (f"{HEADER}\n0,0,1,1,0,2,0,9,0\n", "does not name one actor as kept"),
+        (f"{HEADER}\n0,,1,1,0,2,0,9,1\n", "does not name one actor as kept"),
     ],
 )
 def test_a_damaged_frontier_is_refused(text: str, words: str, tmp_path: Path) -> None:

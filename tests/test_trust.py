@@ -13,11 +13,13 @@ from envtf_lit.actors import TanhGaussianActor
 from envtf_lit.agents import trust as trust_module
 from envtf_lit.agents.et_cql import ETCQL, ETCQLOptions, GuardedRolloutOptions
 from envtf_lit.agents.frontier import Frontier
+from envtf_lit.agents.phases import Batch
 from envtf_lit.agents.trust import Trust
 from envtf_lit.agents.trust_levels import LEAST_GAIN, LEVELS
 from envtf_lit.agents.value_gradient import ImaginedPaths, ValueGradientOptions
 from envtf_lit.critics import StackedCritics
-from envtf_lit.data.loaders import DrawnRows
+from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.data.loaders import DrawnRows, Transitions
 from envtf_lit.imagination import promise as promise_module
 from envtf_lit.imagination.histories import BranchPoints
 from envtf_lit.imagination.promise import Promise, promised
@@ -33,9 +35,36 @@ def make_actor(seed: int = 0) -> TanhGaussianActor:
     return TanhGaussianActor(3, 1, hidden=(8, 8))
 
 
+def rows_of(data: OfflineDataset) -> DrawnRows:
+    return DrawnRows(Transitions(data, discount=0.9))
+
+
+def small() -> dict[str, Any]:
+    """Options that leave 54 of 60 updates to the clone."""
+    gradient = ValueGradientOptions(updates=2, horizon=2)
+    return dict(rollouts=GuardedRolloutOptions(history=2), value_gradient=gradient, critic_updates=4)
+
+
+def alike(rows: Batch) -> Tensor:
+    return torch.ones(len(rows["returns"]))
+
+
+def learned_by_heart() -> Batch:
+    """Four rows; held-out actions are uniform."""
+    data, few = linear_data(EPISODES), torch.arange(4)
+    return dict(
+        observations=torch.as_tensor(data.observations)[few],
+        actions=torch.full((4, 1), 0.9),
+        rewards=torch.zeros(4),
+        returns=torch.arange(4.0),
+        tails=torch.zeros(4),
+        last_observations=torch.as_tensor(data.next_observations)[few],
+    )
+
+
 def watching(actor: TanhGaussianActor) -> Trust:
     trust = Trust(actor)
-    trust.begin(DrawnRows(linear_data(EPISODES)), 0, CPU)
+    trust.begin(rows_of(linear_data(EPISODES)), alike, 0, CPU)
     return trust
 
 
@@ -67,7 +96,7 @@ def test_a_clone_that_explains_the_actions_is_the_first_of_a_better_kind():
     actor = make_actor()
     decided = replace(data, actions=actor.act(torch.as_tensor(data.observations)).numpy())
     trust = Trust(actor)
-    trust.begin(DrawnRows(decided), 0, CPU)
+    trust.begin(rows_of(decided), alike, 0, CPU)
     other = sure(0.0)
     trust.look(other)
     assert not trust.determined
@@ -83,20 +112,8 @@ def test_a_clone_that_explains_the_actions_is_the_first_of_a_better_kind():
 def test_the_warm_start_ends_with_the_clone_not_with_what_was_learned_by_heart(monkeypatch):
     monkeypatch.setattr(trust_module, "CHECK_EVERY", 10)
     monkeypatch.setattr(trust_module, "LEARNING_RATE", 0.03)
-    gradient = ValueGradientOptions(updates=2, horizon=2)
-    options: dict[str, Any] = dict(rollouts=GuardedRolloutOptions(history=2), value_gradient=gradient)
-    agent = hand_driven(ETCQL, source=imagined_batches(), critic_updates=4, **options)  # of 60 updates 54 clone
-    data = linear_data(EPISODES)
-    few = torch.arange(4)  # rows, learned by heart; held-out actions are uniform
-    batch = dict(
-        observations=torch.as_tensor(data.observations)[few],
-        actions=torch.full((4, 1), 0.9),
-        rewards=torch.zeros(4),
-        returns=torch.zeros(4),
-        tails=torch.zeros(4),
-        last_observations=torch.as_tensor(data.next_observations)[few],
-    )
-    seen = []
+    agent = hand_driven(ETCQL, source=imagined_batches(), beta=0.0, **small())
+    batch, seen = learned_by_heart(), []
     for _ in range(54):
         agent.update(batch)
         agent.update_index += 1
@@ -104,6 +121,42 @@ def test_the_warm_start_ends_with_the_clone_not_with_what_was_learned_by_heart(m
     assert float(agent.trust.best) == pytest.approx(min(seen), abs=1e-6) and seen[52] > min(seen) + 0.1
     assert torch.equal(flat(agent.actor.state_dict()), flat(agent.trust.clone.state_dict()))
     assert torch.equal(flat(agent.average_actor.state_dict()), flat(agent.trust.clone.state_dict()))
+
+
+def test_the_clone_is_judged_by_the_rows_that_it_learned_from():
+    """Two actions in the same states; the rows of one went on better."""
+    data = linear_data((1,) * 400)
+    good = torch.arange(400) < 200
+    actions = torch.where(good, 0.6, -0.6)[:, None].numpy()
+    rows = rows_of(replace(data, actions=actions, rewards=torch.where(good, 1.0, -1.0).numpy()))
+    errors = []
+    for weight in (0.0, 1.0):
+        trust = Trust(make_actor())
+        trust.begin(rows, lambda batch, weight=weight: 1.0 + weight * (20.0 * (batch["returns"] > 0) - 1.0), 0, CPU)
+        errors.append([float(trust.look(sure(action))) for action in (0.6, -0.6)])
+    assert errors[0][0] == pytest.approx(errors[0][1], rel=0.2)
+    assert errors[1][0] < 0.0 < errors[1][1]
+
+
+@pytest.mark.parametrize("determined", [False, True])
+def test_better_rows_are_cloned_more_where_states_leave_a_choice(determined):
+    agent = hand_driven(ETCQL, source=imagined_batches(), **small(), beta=2.0)
+    agent.trust.determined.fill_(determined)
+    returns = torch.tensor([0.0, 1.0, 2.0])
+    batch = dict(observations=torch.zeros(3, 3), returns=returns)
+    weights = agent.row_weights(batch)
+    assert bool((weights.diff() > 0).all()) is not determined and bool((weights == 1).all()) is determined
+
+
+def test_the_warm_starts_clone_is_no_distance_from_itself(monkeypatch):
+    """Its rows weighed something else when it was looked at: the values that weigh them have learned since."""
+    monkeypatch.setattr(trust_module, "CHECK_EVERY", 10)
+    monkeypatch.setattr(trust_module, "LEARNING_RATE", 0.03)
+    agent = hand_driven(ETCQL, source=imagined_batches(), **small())
+    for _ in range(54):
+        agent.update(learned_by_heart())
+        agent.update_index += 1
+    assert agent.trust.excess(agent.actor) == pytest.approx(0.0, abs=1e-6)
 
 
 # the constraint
@@ -176,6 +229,7 @@ def test_a_promise_is_the_mean_return_of_whole_imagined_episodes():
         returns.append(total)
     assert abs(found.mean - sum(returns) / 2) < 4 * found.error
     assert found.error == pytest.approx(abs(returns[0] - returns[1]) / 2 / math.sqrt(300), rel=0.05)
+    assert (found.low, found.high) == pytest.approx((min(returns), max(returns)), abs=1.0)
     assert found.lost == 0.0 and found.steps == 40.0
 
 
@@ -221,7 +275,7 @@ def test_the_log_is_left_for_a_clear_gain_alone(promises, errors, price, kept):
     critics = [StackedCritics(3, 1, hidden=(8,), layer_norm=False) for _ in range(3)]
     frontier = Frontier(actors[0], critics[0], 4)
     for place, (mean, error) in enumerate(zip(promises, errors, strict=True)):
-        promise = Promise(mean, error, lost=0.01, steps=9.0)
+        promise = Promise(mean, error, low=0.0, high=200.0, lost=0.01, steps=9.0)
         frontier.add(actors[place], critics[place], update=place, excess=0.1 * place, promise=promise)
     chosen = frontier.choose(price)
     assert torch.equal(flat(chosen.state_dict()), flat(actors[kept].state_dict()))

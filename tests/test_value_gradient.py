@@ -114,9 +114,13 @@ def test_rewards_of_paths_are_divided_by_the_scale():
     torch.testing.assert_close(rewards(4.0), rewards(1.0) / 4.0)
 
 
-def test_rollouts_go_on_where_they_stood_until_they_are_old(monkeypatch):
-    monkeypatch.setattr(value_gradient, "OLDEST", 6)
-    paths, generator = ImaginedPaths(imagination(), OPTIONS), torch.Generator().manual_seed(0)
+@pytest.mark.parametrize("cut_short", [True, False])
+def test_rollouts_go_on_where_they_stood_until_they_are_as_old_as_an_episode(cut_short, monkeypatch):
+    """As old as the log's time limit, if it has one."""
+    imagined = imagination()
+    imagined.longest_recorded, imagined.cut_short = (6, True) if cut_short else (1, False)
+    monkeypatch.setattr(value_gradient, "OLDEST", 60 if cut_short else 6)
+    paths, generator = ImaginedPaths(imagined, OPTIONS), torch.Generator().manual_seed(0)
     actor: Any = Constant(0.1)
     first, second, third = (paths.next(actor, ONE, generator) for _ in range(3))
     torch.testing.assert_close(second.observations[0], first.next_observations[-1])
@@ -165,9 +169,9 @@ def test_guards_hold_the_policy_where_the_model_knows_its_way():
 
 
 @pytest.mark.parametrize("kind", ["transformer", "ensemble"])
-def test_a_rollout_stays_in_its_world_until_it_begins_anew(kind, monkeypatch):
-    monkeypatch.setattr(value_gradient, "OLDEST", 9)
+def test_a_rollout_stays_in_its_world_until_it_begins_anew(kind):
     imagined = imagination(posterior=1.0)
+    imagined.longest_recorded, imagined.cut_short = 9, True
     torch.manual_seed(0)
     if kind == "transformer":
         model: Any = EnvironmentTransformer(3, 1, layers=1, heads=1, width=8, context=4)

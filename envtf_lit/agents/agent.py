@@ -42,10 +42,13 @@ class Agent(Algorithm):
         optimizers = optimizers if isinstance(optimizers, list) else [optimizers]
         return optimizers[list(self.parts()).index(part)]
 
+    def in_units(self, batch: Batch) -> Batch:
+        """Rows of the log with rewards and returns as they are learned."""
+        return batch | {name: batch[name] / self.return_scale for name in ("rewards", "returns")}
+
     def update(self, batch: Batch) -> Logs:
         """One update in the phase that is under way; returns detached scalars to log."""
-        scaled = {name: batch[name] / self.return_scale for name in ("rewards", "returns")}
-        batch = batch | scaled | {"real": torch.ones_like(batch["rewards"])}
+        batch = self.in_units(batch) | {"real": torch.ones_like(batch["rewards"])}
         done = self.update_index
         for phase in self.phases:
             if done < phase.updates:

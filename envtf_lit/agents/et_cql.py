@@ -4,13 +4,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
+import torch
 from torch import Tensor
 
 from envtf_lit.actors import Actor
 from envtf_lit.agents.actor_critic import ActorCritic
+from envtf_lit.agents.advantages import AdvantageWeights
 from envtf_lit.agents.combo import COMBO, ImaginingOptions, MixingOptions
 from envtf_lit.agents.cql import CQL, ConservativeOptions
 from envtf_lit.agents.frontier import Frontier
+from envtf_lit.agents.networks import PlainStateValue
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.phases import Batch, Logs, Losses, Part, Phase
 from envtf_lit.agents.trust import Trust, WatchedWarmStart
@@ -68,6 +71,8 @@ class ETCQLOptions(MixingOptions, ConservativeOptions):
     Attributes:
         trust: how far the policy may leave what the log supports: `cautious`, `default`, or `bold`, which is for those
             who can try it in a simulator (`trust_levels.LEVELS`).
+        beta: by which advantages over the log, in units of their root mean square, are multiplied in the weights
+            exp(beta A) of the rows that are cloned; 0 clones all alike.
         critic_updates: before the value gradient, in which critics learn the clone's value on real rows and on those of
             `generate_rollouts`. All updates before are the warm start, whatever the common `warm_start` says.
         value_gradient: the end of the training, in which the actor follows the gradient through the world model.
@@ -78,6 +83,7 @@ class ETCQLOptions(MixingOptions, ConservativeOptions):
     real_ratio: NonzeroShare = 0.5
     refresh_every: Natural = rare(0)
     trust: TrustLevel = "default"
+    beta: NonNegative = rare(2.0)
     critic_updates: Natural = 1_000
     rollouts: GuardedRolloutOptions = field(default_factory=GuardedRolloutOptions)
     value_gradient: ValueGradientOptions = field(default_factory=ValueGradientOptions)
@@ -110,12 +116,12 @@ class ETCQLOptions(MixingOptions, ConservativeOptions):
         return replace(super().within(reach), value_gradient=replace(self.value_gradient, horizon=horizon))
 
 
-class ETCQL(COMBO):
+class ETCQL(AdvantageWeights, COMBO):
     """Conservative Q-learning on the log and on long imagination, in one objective, as far as the log can be left.
 
-    A clone, stopped by held-out likelihood; critics that learn its conservative Q (COMBO's form) on real rows and on
-    those of `generate_rollouts`; then `ValueGradient`: the actor climbs imagined returns that end in that Q, which goes
-    on learning, under a constraint on its held-out likelihood.
+    A clone of the better rows, stopped by held-out likelihood; critics that learn its conservative Q (COMBO's form) on
+    real rows and on those of `generate_rollouts`; then `ValueGradient`: the actor climbs imagined returns that end in
+    that Q, which goes on learning, under a constraint on its held-out likelihood.
     """
 
     Options: ClassVar[type[PolicyOptions]] = ETCQLOptions
@@ -128,6 +134,8 @@ class ETCQL(COMBO):
 
     def build_networks(self) -> None:
         ActorCritic.build_networks(self)  # no temperature: nothing here asks for entropy
+        o = self.options
+        self.value = PlainStateValue(self.observation_dim, hidden=o.hidden, layer_norm=o.layer_norm)
         self.trust = Trust(self.actor)
         self.frontier = Frontier(self.actor, self.critics, 1 + PLACES)
 
@@ -141,15 +149,32 @@ class ETCQL(COMBO):
         return dict(
             actor=Part(self.actor, self.options.actor_learning_rate),
             critics=Part(self.critics, self.options.critic_learning_rate),
+            value=Part(self.value, self.options.critic_learning_rate),
             actor_by_gradient=Part(self.actor, self.options.value_gradient.learning_rate, BETAS),
         )
 
     def warm_start_losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
-        """As of COMBO; least squares join the clone's likelihood where the log's states decide its actions."""
+        """As of COMBO, and the log's own value; least squares join the clone's likelihood where states decide actions.
+
+        What states decide cannot be done better in one row than in another.
+        """
+        loss = self.value_loss(batch)
+        yield "value", loss, dict(value_loss=loss)
         for part, loss, logs in super().warm_start_losses(batch):
             if part == "actor" and self.trust.determined:
                 loss = loss + self.actor.least_squares(batch["observations"], batch["actions"])
             yield part, loss, logs
+
+    def clone_loss(self, batch: Batch) -> Tensor:
+        """The weighted mean of the rows' errors; `batch` has complete returns."""
+        weight = self.row_weights(batch)
+        return (weight * self.actor.clone_error(batch["observations"], batch["actions"])).sum() / weight.sum()
+
+    def row_weights(self, batch: Batch) -> Tensor:
+        """(B,) what rows with complete returns count in cloning: all alike where states decide actions."""
+        if self.trust.determined:
+            return torch.ones_like(batch["returns"])
+        return self.advantage_weights(batch, self.options.beta)
 
     def losses(self, batch: Batch) -> Iterator[tuple[str, Tensor, Logs]]:
         """The critics' alone: the actor stays the clone until it follows the gradient."""
@@ -164,7 +189,11 @@ class ETCQL(COMBO):
                 f"{self.label} watches its likelihood of held-out episodes, and none are held out: give the share of "
                 "the episodes to hold out, held_out=0.1."
             )
-        self.trust.begin(data.validation_rows, self.seed, self.device)
+        self.trust.begin(data.validation_rows, self.held_out_weights, self.seed, self.device)
+
+    def held_out_weights(self, batch: Batch) -> Tensor:
+        """(B,) what held-out rows count, as the log has them."""
+        return self.row_weights(self.complete_returns(self.in_units(batch)))
 
     def published_critics(self) -> Critics:
         """Those of the actor that was kept, as they were when it was put on the frontier."""

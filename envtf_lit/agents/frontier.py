@@ -2,6 +2,7 @@
 
 import copy
 import math
+from dataclasses import astuple
 from typing import Any
 
 import torch
@@ -38,7 +39,7 @@ class Frontier(nn.Module):
         place = int(self.count)
         self.actors[place].load_state_dict(actor.state_dict())
         self.critics[place].load_state_dict(critics.state_dict())
-        row = (float(update), excess, promise.mean, promise.error, promise.lost, promise.steps)
+        row = (float(update), excess, *astuple(promise))
         self.table[place] = torch.tensor(row, dtype=torch.float64)
         self.count += 1
 

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +22,9 @@ DETERMINED = 0.1  # of held-out actions' variance: a clone that leaves less unex
 
 
 class Trust(nn.Module):
-    """The constraint `E[-log pi(a|s)] / A <= that of the best clone + slack`, over rows that nothing learns from.
+    """The constraint `E[-w log pi(a|s)] / A <= that of the best clone + slack`, over rows that nothing learns from.
+
+    The weights w are those that the clone learned with.
 
     The weight of the actor's clone loss is its dual variable: it grows while the constraint is broken and shrinks while
     it is not (dual ascent, as SAC's temperature: Haarnoja et al. 2018, section 5).
@@ -48,37 +51,42 @@ class Trust(nn.Module):
         self.register_buffer("log_weight", torch.tensor(math.log(FIRST)))
         self.rows: DrawnRows | None = None
 
-    def begin(self, rows: DrawnRows, seed: int, device: torch.device) -> None:
-        """Takes the rows to watch, and draws those of each look, the same every time."""
-        self.rows = rows
+    def begin(self, rows: DrawnRows, weigh: Callable[[Batch], Tensor], seed: int, device: torch.device) -> None:
+        """Takes the rows to watch and what each weighs, (B,); draws those of each look, the same every time."""
+        self.rows, self.weigh = rows, weigh
         self.looked_at = rows.draw(CHECKED, epoch_generator(seed, 0, "held out", device))
 
     @torch.no_grad()
     def look(self, actor: Actor) -> Tensor:
         """() the actor's error on held-out rows; the clone is the best so far, of those of one way to clone."""
         observations, actions = self.looked_at["observations"], self.looked_at["actions"]
-        error = actor.clone_error(observations, actions).mean()
         left = (actor.act(observations) - actions).square().mean(0).sum() / actions.var(0).sum()
         if not self.determined and left < DETERMINED:
             self.determined.fill_(True)
             self.best.fill_(math.inf)
+        error = self.error(actor, self.looked_at)
+        if self.best.isfinite():  # rows may weigh something else than they did at the look before
+            self.best.copy_(self.error(self.clone, self.looked_at))
         if error < self.best:
             self.best.copy_(error)
             self.clone.load_state_dict(actor.state_dict())
         return error
 
+    def error(self, actor: Actor, rows: Batch) -> Tensor:
+        """() the weighted mean of `Actor.clone_error`."""
+        weight = self.weigh(rows)
+        return (weight * actor.clone_error(rows["observations"], rows["actions"])).sum() / weight.sum()
+
     @torch.no_grad()
     def excess(self, actor: Actor) -> float:
         """Nats per action dimension by which an actor is less likely than the clone."""
-        error = actor.clone_error(self.looked_at["observations"], self.looked_at["actions"]).mean()
-        return float(error - self.best)
+        return float(self.error(actor, self.looked_at) - self.best)
 
     @torch.no_grad()
     def ascend(self, actor: Actor, slack: float, generator: torch.Generator) -> Tensor:
         """() the dual variable after a step, on fresh rows: of `sum_d -log pi(a_d|s)`, not of its mean."""
         assert self.rows is not None
-        rows = self.rows.draw(ROWS, generator)
-        error = actor.clone_error(rows["observations"], rows["actions"]).mean()
+        error = self.error(actor, self.rows.draw(ROWS, generator))
         self.log_weight += RATE * (error - self.best - slack)
         self.log_weight.clamp_(math.log(LEAST), math.log(MOST))
         return self.log_weight.exp()

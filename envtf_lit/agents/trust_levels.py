@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 FRONTIER, CLONE = "frontier", "clone"  # the table and the actor beside a published policy
-COLUMNS = ("update", "excess", "promise", "error", "lost", "steps")
+COLUMNS = ("update", "excess", "promise", "error", "low", "high", "lost", "steps")
 LEAST_GAIN = 0.05  # of what is promised of the clone: what less is promised for is not worth leaving the log
 
 

@@ -28,7 +28,7 @@ REAL_ROWS = 0.25  # share of the real ones in each of the critics' batches
 TRACE = 0.95  # lambda of the critics' TD(lambda) targets
 TARGET_RATE = 0.3  # share of the critics that enters the target critics at each update of the actor
 FIRSTS = 0.25  # share of the real states that rollouts begin at which are the first of an episode
-OLDEST = 1_000  # steps after which a rollout begins anew at a real state
+OLDEST = 1_000  # steps after which a rollout begins anew at a real state, where the log knows no time limit
 BETAS = (0.7, 0.95)  # of the actor's Adam, as in SHAC
 CLIP = 1.0  # largest norm of the actor's gradient
 PLACES = 4  # actors on the way that a promise is asked of
@@ -163,7 +163,7 @@ class ImaginedPaths:
         actions = paths.actions[horizon - history :]
         fresh = self._fresh(generator)
         self.age += horizon
-        ended = (paths.terminated | paths.halted).any(0) | (self.age >= OLDEST)  # (B,)
+        ended = (paths.terminated | paths.halted).any(0) | (self.age >= self.imagination.longest(OLDEST))  # (B,)
         self.age[ended] = 0
         self.histories = Histories(
             torch.where(ended[:, None, None], fresh.observations, observations.transpose(0, 1)),
@@ -219,7 +219,7 @@ class ValueGradient(Phase):
             last = paths.next_observations[-1]
             end = agent.critics(last, agent.actor.sample(last, generator=agent.generator)[0]).min(0).values
             imagined = imagined_return(paths, end, low, agent.options.discount).mean()
-            clone_loss = agent.clone_loss(batch)
+            clone_loss = agent.clone_loss(agent.complete_returns(batch))
             loss = weight * agent.action_dim * clone_loss - imagined
             agent.descend("actor_by_gradient", loss, rate=self.rate(progress), clip=CLIP)
         cut = (standing(paths)[0][:-1] & paths.halted).any(0).float().mean()

@@ -4,16 +4,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
+from envtf_lit.agents.advantages import AdvantageWeights
 from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.networks import PlainStateValue
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.phases import Batch, Logs, Part
 from envtf_lit.options.numbers import NonNegative
-
-LARGEST_WEIGHT = 20.0  # of a row, as AWR has it
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,7 @@ class WBCOptions(PolicyOptions):
     beta: NonNegative = 1.0
 
 
-class WBC(Agent):
+class WBC(AdvantageWeights, Agent):
     """Clones the log, each row with a weight that says how much better it went on than its state's value."""
 
     Options: ClassVar[type[PolicyOptions]] = WBCOptions
@@ -49,24 +47,9 @@ class WBC(Agent):
         yield "value", loss, dict(value_loss=loss)
         yield "actor", *self.actor_loss(batch)
 
-    @torch.no_grad()
-    def complete_returns(self, batch: Batch) -> Batch:
-        """`G + gamma^n V(s_T)` for episodes that were cut after n steps, in s_T; what terminated keeps its return."""
-        return batch | {"returns": batch["returns"] + batch["tails"] * self.value(batch["last_observations"])}
-
-    def value_loss(self, batch: Batch) -> Tensor:
-        """`(V(s) - G)^2`, G the Monte-Carlo return that was recorded (AWR, equation 3)."""
-        return (self.value(batch["observations"]) - batch["returns"]).square().mean()
-
     def actor_loss(self, batch: Batch) -> tuple[Tensor, Logs]:
-        """`-min(exp(beta (G - V(s)) / c), 20) log pi(a|s)`, c the advantages' root mean square (MARWIL, section 4.2).
-
-        The scale of rewards does not matter; c is that of the batch, where MARWIL has a moving mean.
-        """
-        with torch.no_grad():
-            advantage = batch["returns"] - self.value(batch["observations"])
-            scale = advantage.square().mean().sqrt().clamp(min=1e-6)
-            weight = torch.exp(self.options.beta * advantage / scale).clamp(max=LARGEST_WEIGHT)
+        """`-w log pi(a|s)`, w the row's advantage weight (MARWIL, section 4.2)."""
+        weight = self.advantage_weights(batch, self.options.beta)
         error = self.actor.clone_error(batch["observations"], batch["actions"])
         loss = (weight * error).mean()
         return loss, dict(clone_loss=error.mean(), weighted_clone_loss=loss, weight=weight.mean())

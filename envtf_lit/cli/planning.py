@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from envtf_lit.cli.output import console, hush_lightning
 from envtf_lit.cli.signatures import CORES, File, Folder, Natural, Positive, run_command
 from envtf_lit.errors import UserError
+from envtf_lit.options.schema import Precision
 
 if TYPE_CHECKING:
     from envtf_lit.evaluation.planning import PlannedReturns
@@ -30,7 +31,7 @@ class Episodes:
     episodes: Positive = 1
     steps: Positive | None = None
     seed: Natural = 0
-    precision: Literal["fp32", "bf16"] = "fp32"
+    precision: Precision = "fp32"
 
 
 def plan(

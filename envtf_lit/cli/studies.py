@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from envtf_lit.cli.output import console, hush_lightning
 from envtf_lit.cli.signatures import CORES, File, Folder, Natural, Positive, Robot, run_command
 from envtf_lit.errors import UserError
+from envtf_lit.options.schema import Precision
 
 if TYPE_CHECKING:
     from envtf_lit.studies.suite import SuiteOptions
@@ -203,7 +204,7 @@ def bench_model(
     *,
     preset: str = "small",
     device: Device | None = None,
-    precision: Literal["fp32", "bf16"] = "bf16",
+    precision: Precision = "auto",
     compile: bool = False,
     windows: Positive | None = None,
     batch: Positive = 4_096,

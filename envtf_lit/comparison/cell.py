@@ -15,6 +15,7 @@ from envtf_lit.comparison.grid import Cell
 from envtf_lit.comparison.records import Evaluation, Run
 from envtf_lit.comparison.settings import cell_params
 from envtf_lit.comparison.shared import Home
+from envtf_lit.devices import pick_device
 from envtf_lit.divergence import Diverged
 from envtf_lit.files import write_text
 from envtf_lit.pipeline.stage import POLICIES
@@ -22,7 +23,6 @@ from envtf_lit.pipeline.train_policy import train_policy
 from envtf_lit.policy import Policy, load_policy
 from envtf_lit.robots.returns import Returns, evaluate_policy
 from envtf_lit.studies.machine import code_version, hardware, peak_memory_mb
-from envtf_lit.training import pick_device
 
 LAST = 10  # evaluations along the way whose mean is `score_last10`
 # Episodes begin from other seeds for each training seed and for each data seed (development and reporting), and along

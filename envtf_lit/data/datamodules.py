@@ -189,7 +189,8 @@ class TransitionData(L.LightningDataModule):
         if self.validation is None:
             return None
         weights = None if self.return_weights is None else self.return_weights(self.validation)
-        return DrawnRows(self.validation, weights, _device(self))
+        rows = Transitions(self.validation, discount=self.discount, n_step=self.n_step, device=_device(self))
+        return DrawnRows(rows, weights, _device(self))
 
     @cached_property
     def effective_episodes(self) -> float:

@@ -194,26 +194,6 @@ def _place(column: Column, device: torch.device, resident: bool) -> Tensor | Fil
     return placed
 
 
-class DrawnRows:
-    """Observations and actions of a log, rows drawn at random.
-
-    Args:
-        dataset: whose rows.
-        weights: (N,) chances of each row, up to a factor; None draws uniformly.
-        device: where they go.
-    """
-
-    def __init__(
-        self, dataset: OfflineDataset, weights: Tensor | None = None, device: torch.device | str = "cpu"
-    ) -> None:
-        self.rows = WeightedRows(torch.ones(len(dataset)) if weights is None else weights, device)
-        self.store = Store(dataset, ("observations", "actions"), device)
-
-    def draw(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """`observations` (count, S) and `actions` (count, A); `generator` is on the device."""
-        return self.store[self.rows.draw((count,), generator)]
-
-
 class Windows(Dataset[dict[str, Tensor]]):
     """Windows of up to T consecutive steps that never cross an episode.
 
@@ -322,3 +302,23 @@ class Transitions(Dataset[dict[str, Tensor]]):
     def complete_returns(self) -> Tensor:
         """(N,) returns to go in which truncated episodes go on at the `typical_return`."""
         return self.columns["returns"] + self.columns["tails"] * self.typical_return
+
+
+class DrawnRows:
+    """Rows of a log drawn at random.
+
+    Args:
+        transitions: the rows.
+        weights: (N,) chances of each row, up to a factor; None draws uniformly.
+        device: where the rows lie.
+    """
+
+    def __init__(
+        self, transitions: Transitions, weights: Tensor | None = None, device: torch.device | str = "cpu"
+    ) -> None:
+        self.transitions = transitions
+        self.rows = WeightedRows(torch.ones(len(transitions)) if weights is None else weights, device)
+
+    def draw(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """The columns of `Transitions`, (count, …); `generator` is on the device."""
+        return self.transitions[self.rows.draw((count,), generator)]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from envtf_lit.critics import CRITICS, PolicyCritics, load_critics
+from envtf_lit.devices import autocast
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.dream import Dream, DreamOptions
 from envtf_lit.options.schema import Precision, build
@@ -21,7 +22,6 @@ from envtf_lit.registration import ENV_ID
 from envtf_lit.robots.environments import action_limits, robot_in
 from envtf_lit.robots.returns import Returns, evaluate_policy
 from envtf_lit.robots.tasks import ROBOTS, Robot
-from envtf_lit.training import autocast
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination_head import termination_rule

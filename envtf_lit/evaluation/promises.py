@@ -1,4 +1,4 @@
-"""What a policy is promised to return, as a range: the model's doubt, and its error where the truth is known."""
+"""What a policy is promised to return, as a range: how imagined episodes end, and the model's error where known."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,6 @@ from envtf_lit.files import check_plain
 
 Places = list[dict[str, float]]  # what a frontier.csv says of each actor, from the clone outward
 MOST_BYTES = 1 << 20  # of a frontier.csv
-ERRORS = 2.0  # standard errors of a promise that its range reaches to either side
 
 
 @dataclass(frozen=True)
@@ -27,20 +26,24 @@ class Range:
 
 
 def promised_range(row: Mapping[str, float], held_out: Mapping[str, float]) -> Range:
-    """The mean return that an actor of the frontier is promised, as a range: `promise -+ (2 error + steps |b|)`.
+    """The return that an actor of the frontier is promised, as a range: `[low - steps |b|, high + steps |b|]`.
+
+    From `low` to `high` lie the returns of nine of ten imagined episodes. Not their mean: where a robot always begins
+    alike, its episodes share one fate, and what the model takes for the fate of some may be that of all
+    (docs/log/trust.md: of 23 policies 21 earned what lies there, 8 what two standard errors about the mean hold).
 
     `b` is what the model errs by per step where the truth is known: of the held-out episodes, whose actions it is given
     and nothing else, the mean imagined return less the mean recorded one, divided by their steps. What an actor's
-    imagined episodes are longer, adds to it. The model's doubt (`error`) and its bias are different things: on the log
-    of a machine that was held back the one was 5 and the other 780 of a return of 2,850.
+    imagined episodes are longer, adds to it. The model's doubt and its bias are different things: on the log of a
+    machine that was held back the one was 5 and the other 780 of a return of 2,850.
 
     Args:
-        row: of `frontier.csv`: `promise`, `error` and `steps`.
+        row: of `frontier.csv`: `low`, `high` and `steps`.
         held_out: of the metrics (`metrics.held_out_metrics`).
     """
     bias = abs(held_out["imagined_return_mean"] - held_out["return_mean"]) / max(1.0, held_out["steps_mean"])
-    reach = ERRORS * row["error"] + bias * row["steps"]
-    return Range(row["promise"] - reach, row["promise"] + reach)
+    reach = bias * row["steps"]
+    return Range(row["low"] - reach, row["high"] + reach)
 
 
 def read_frontier(folder: Path) -> Places | None:

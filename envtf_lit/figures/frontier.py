@@ -7,8 +7,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from envtf_lit.agents.trust_levels import CLONE, LEVELS
-from envtf_lit.evaluation.promises import ERRORS, Places, kept, promised_range
+from envtf_lit.evaluation.promises import Places, kept, promised_range
 from envtf_lit.figures.style import COLOURS, drawing, policy_colours, write_table
+
+ERRORS = 2.0  # standard errors of the mean that a bar reaches to either side
 
 
 def frontier_picture(
@@ -56,7 +58,7 @@ def frontier_picture(
         axis.set(
             xlabel="distance from the log: how much likelier the clone makes held-out actions (nats per dimension)"
         )
-        axis.set_ylabel("return of an episode\n(bar: doubt; line: the range)")
+        axis.set_ylabel("return of an episode\n(bar: of the mean; line: of an episode)")
         axis.set_title("What the world model promises, and how far from the log")
         entries = dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))  # one of each
         figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=5, fontsize="small")

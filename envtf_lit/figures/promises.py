@@ -35,7 +35,8 @@ def about_promises(run: Run) -> str:
     bias = (run.held_out["imagined_return_mean"] - run.held_out["return_mean"]) / run.held_out["steps_mean"]
     return _joined(
         *(_about(run, name) for name in run.frontiers),
-        "A range is the mean of whole imagined episodes, two standard errors to either side, and what the model errs",
+        "A range holds nine of ten whole imagined episodes (a robot that always begins alike may live through any of",
+        "them every time), and to either side what the model errs",
         f"by on held-out episodes, whose actions it was given and whose return is known: {bias:+.2g} for each step.",
     )
 

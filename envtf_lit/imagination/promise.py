@@ -10,6 +10,7 @@ from envtf_lit.imagination.buffer import Imagination
 from envtf_lit.policy import Policy
 from envtf_lit.world_models.unroll import lost, unroll
 
+TAIL = 0.05  # share of the episodes that end below `Promise.low`, and above `Promise.high`
 LONGEST = 1_000  # steps of an imagined episode that neither a fall nor the log's time limit ends
 
 
@@ -20,12 +21,15 @@ class Promise:
     Attributes:
         mean: over episodes.
         error: standard error of the mean; each episode runs in a world of its own, so that it holds the model's doubt.
+        low, high: between which nine of ten episodes' returns lie.
         lost: share of the steps at which the model had left what it knows, or was overpaid (`Imagination`).
         steps: mean length of the episodes.
     """
 
     mean: float
     error: float
+    low: float
+    high: float
     lost: float
     steps: float
 
@@ -70,4 +74,5 @@ def promised(imagination: Imagination, policy: Policy, *, episodes: int, generat
         beyond = lost(step.prediction, options.novelty_limit) | imagination.overpaid(step.prediction)
         steps, strayed = steps + len(step.rows), strayed + int(beyond.sum())
     error = float(total.std()) / math.sqrt(episodes)
-    return Promise(float(total.mean()), error, lost=strayed / max(1, steps), steps=steps / episodes)
+    worst, best = total.quantile(torch.tensor([TAIL, 1.0 - TAIL], dtype=total.dtype, device=device)).tolist()
+    return Promise(float(total.mean()), error, worst, best, lost=strayed / max(1, steps), steps=steps / episodes)

@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol, TypeVar, Union, get_args, get_origin,
 
 from envtf_lit.errors import UserError, did_you_mean
 
-Precision = Literal["fp32", "bf16"]
+Precision = Literal["auto", "fp32", "bf16"]
 Options = TypeVar("Options")
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from envtf_lit.data.sources.files import load_dataset
+from envtf_lit.devices import pick_device
 from envtf_lit.files import check_writable
 from envtf_lit.imagination.histories import BranchPoints
 from envtf_lit.imagination.rollouts import NoisyPolicy, Rollouts, imagine
@@ -23,7 +24,6 @@ from envtf_lit.pipeline.stage import (
     run_stage,
 )
 from envtf_lit.policy import load_policy
-from envtf_lit.training import pick_device
 from envtf_lit.world_models.observed import as_observed
 from envtf_lit.world_models.store import load_world_model
 from envtf_lit.world_models.termination_head import termination_rule

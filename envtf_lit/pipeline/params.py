@@ -64,7 +64,8 @@ class Params:
         task: robot and tier, such as `hopper-medium-replay`, or null for a robot of your own.
         seed: of everything random.
         threads: CPU threads of each stage; part of what makes results equal to the bit.
-        precision: of matrix products in training and imagination; losses and optimisers stay in fp32.
+        precision: of matrix products in training and imagination; losses and optimisers stay in fp32. `auto` is bf16
+            where the device multiplies it natively, else fp32: on a CPU that cannot, bf16 takes fifty times as long.
         compile: world models train and imagine through torch.compile, which takes a minute to begin with: pays on a
             GPU, where launching their many small operations is what takes the time.
         download: the dataset.
@@ -79,7 +80,7 @@ class Params:
     task: str | None = "hopper-medium-replay"
     seed: Natural = 0
     threads: Count = 2
-    precision: Precision = "bf16"
+    precision: Precision = "auto"
     compile: bool = False
     download: DownloadOptions = field(default_factory=DownloadOptions)
     train_model: dict[str, WorldModelOptions] = field(default_factory=_default_models)

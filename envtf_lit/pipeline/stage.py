@@ -12,6 +12,7 @@ import lightning as L
 import torch
 
 from envtf_lit.agents.options import NO_WORLD_MODEL, PolicyOptions
+from envtf_lit.devices import resolved
 from envtf_lit.files import read_json, write_json
 from envtf_lit.imagination.options import GenerateRolloutsOptions
 from envtf_lit.pipeline.params import Params
@@ -47,8 +48,8 @@ def run_settings(
     params: Params, options: WorldModelOptions | PolicyOptions | GenerateRolloutsOptions
 ) -> dict[str, Any]:
     """What a run's result depends on, beside its input files."""
-    common = {name: getattr(params, name) for name in ("seed", "threads", "precision", "compile")}
-    return common | {"options": asdict(options)}
+    common = {name: getattr(params, name) for name in ("seed", "threads", "compile")}
+    return common | {"precision": resolved(params.precision), "options": asdict(options)}
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ from envtf_lit.agents.registry import ALGORITHMS
 from envtf_lit.agents.store import publish_policy
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.options import UPDATES_PER_STEP
+from envtf_lit.devices import pick_device
 from envtf_lit.imagination.buffer import Imagination, ImaginedBatches
 from envtf_lit.imagination.store import load_rollouts
 from envtf_lit.pipeline.dataset import dataset_of
@@ -26,7 +27,7 @@ from envtf_lit.pipeline.stage import (
     unseen,
 )
 from envtf_lit.progress import note
-from envtf_lit.training import pick_device, run_folder, trained
+from envtf_lit.training import run_folder, trained
 from envtf_lit.world_models.fit import REACH, known_reach
 from envtf_lit.world_models.observed import as_observed
 from envtf_lit.world_models.store import load_world_model

@@ -63,7 +63,7 @@ def _torn_mujoco() -> dict[str, str]:
 def _torch() -> dict[str, str]:
     import torch
 
-    from envtf_lit.training import pick_device
+    from envtf_lit.devices import pick_device, resolved
 
     device = pick_device()
     name = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
@@ -71,6 +71,7 @@ def _torch() -> dict[str, str]:
         "cores": f"{_usable_cores()} usable of {os.cpu_count()}",
         "torch threads": f"{torch.get_num_threads()} (OMP_NUM_THREADS {os.environ.get('OMP_NUM_THREADS', 'not set')})",
         "device": f"{device} {name}".strip(),
+        "precision": f"auto is {resolved('auto', device)} here",
     }
 
 

@@ -28,6 +28,7 @@ from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.options import UPDATES_PER_STEP
 from envtf_lit.data.sources.files import save_dataset
+from envtf_lit.devices import resolved
 from envtf_lit.errors import UserError
 from envtf_lit.files import write_json
 from envtf_lit.options.schema import Precision
@@ -35,6 +36,7 @@ from envtf_lit.pipeline.train_policy import transition_data
 from envtf_lit.results import claim
 from envtf_lit.studies import d3rlpy_worker
 from envtf_lit.studies.machine import facts, in_turns, ratio, typical
+from envtf_lit.training import LIGHTNING
 
 CPU = torch.device("cpu")
 ROWS, LENGTH, S, A = 10_000, 500, 11, 3  # of the log: its dimensions are Hopper's
@@ -89,8 +91,8 @@ def bench_agents(
         log = _write_log(Path(folder))
         both: tuple[Precision, ...] = ("fp32", "bf16")
         sides = {f"{name}_{one}": _ours(log, name, counts[name], one) for name in OPTIONS for one in both}
-        sides["default"] = _ours(log, "default", updates, "bf16")
-        sides["bare"] = _bare(log, "default", updates, "bf16")
+        sides["default"] = _ours(log, "default", updates, "auto")
+        sides["bare"] = _bare(log, "default", updates, "auto")
         sides |= _stacks(NETS["hidden"], NETS["batch_size"])
         with their_side(d3rlpy, log.with_suffix(".npz"), threads) as (versions, run):
             if run is not None:
@@ -98,7 +100,7 @@ def bench_agents(
             timings = in_turns(sides, rounds)
     counts |= {"default": updates, "bare": updates}
     result = _ratios(timings, their=bool(versions)) | _rates(timings, counts)
-    result |= dict(updates=updates, rounds=rounds) | facts(CPU, "bf16") | versions
+    result |= dict(updates=updates, rounds=rounds) | facts(CPU, "auto") | versions
     if out is not None:
         write_json(out, result)
     return result
@@ -111,7 +113,7 @@ def _ratios(timings: list[dict[str, float]], *, their: bool) -> dict[str, float 
     return {
         "cql_vs_d3rlpy_fp32": against("cql"),
         "cql_vs_d3rlpy_bf16": against("cql", "bf16"),
-        **{f"{name}_vs_d3rlpy": against(name, "bf16") for name in ("iql", "td3_bc", "rebrac")},
+        **{f"{name}_vs_d3rlpy": against(name, resolved("auto", CPU)) for name in ("iql", "td3_bc", "rebrac")},
         **{f"{name}_vs_d3rlpy_fp32": against(name) for name in ("iql", "td3_bc", "rebrac")},
         "stacked_seeds_ratio": ratio(timings, "one_after_another", "stacked"),
         "lightning_share": 1.0 - ratio(timings, "bare", "default"),
@@ -169,7 +171,7 @@ def fit(agent: Agent, data: TransitionData, precision: Precision) -> float:
     clock = _Clock()
     trainer = L.Trainer(
         max_epochs=1,
-        precision="bf16-mixed" if precision == "bf16" else "32-true",
+        precision=LIGHTNING[resolved(precision, CPU)],
         accelerator="cpu",
         callbacks=[clock],
         logger=False,
@@ -219,7 +221,7 @@ def _bare(log: Path, name: str, updates: int, precision: Precision) -> Callable[
         batches = data.train_dataloader()
 
         def loop() -> None:
-            with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16", cache_enabled=False):
+            with torch.autocast("cpu", torch.bfloat16, enabled=resolved(precision, CPU) == "bf16", cache_enabled=False):
                 for index, batch in enumerate(batches):
                     agent.training_step(batch, index)
 

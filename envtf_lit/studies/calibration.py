@@ -11,6 +11,7 @@ import numpy as np
 
 from envtf_lit.data.cards import markdown_table
 from envtf_lit.data.dataset import OfflineDataset
+from envtf_lit.devices import pick_device
 from envtf_lit.evaluation.calibration import (
     Points,
     auroc,
@@ -31,7 +32,6 @@ from envtf_lit.robots.returns import SEED_OFFSET
 from envtf_lit.robots.tasks import Task
 from envtf_lit.studies.study import Study
 from envtf_lit.studies.suite import MODELS, Suite, cached_result, flat_settings, load_for_study
-from envtf_lit.training import pick_device
 from envtf_lit.world_models.forecast import Scale, forecast, whole_episodes
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.zoo.collect import collect

@@ -17,12 +17,13 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
+from envtf_lit.devices import pick_device
 from envtf_lit.files import write_json
 from envtf_lit.results import claim
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.studies.machine import facts
 from envtf_lit.studies.suite import WORK, SuiteOptions, build_suite, model_options
-from envtf_lit.training import pick_device, run_folder, trained
+from envtf_lit.training import run_folder, trained
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.forecast import Scale, forecast, nmse, segments
 from envtf_lit.world_models.lit import lit_world_model, window_data

@@ -15,11 +15,12 @@ from typing import Any
 import pandas as pd
 
 from envtf_lit.data.sources.files import save_dataset
+from envtf_lit.devices import pick_device, resolved
 from envtf_lit.files import write_json
 from envtf_lit.results import claim
 from envtf_lit.robots.tasks import get_task
 from envtf_lit.studies.machine import facts
-from envtf_lit.training import pick_device
+from envtf_lit.training import LIGHTNING
 from envtf_lit.zoo.collect import collect
 
 BASE, TARGET = "hopper-medium-replay", "hopper-medium-replay-hidden"
@@ -90,7 +91,7 @@ def run_finetune(out: Path | None = None, *, work: Path = WORK, options: Finetun
     }
     run = work / f"tuned-{updates}-{options.learning_rate:g}-{parts}"
     tuned = _fit(run, data, updates, options.every, options.seed, flags)
-    result = compare_curves(scratch, short, tuned) | asdict(options) | facts(pick_device(), "bf16")
+    result = compare_curves(scratch, short, tuned) | asdict(options) | facts(pick_device(), "auto")
     if out is not None:
         write_json(out, result)
     return result
@@ -136,7 +137,7 @@ def _fit(run: Path, data: Path, updates: int, every: int, seed: int, further: di
             "model.options.updates_per_epoch": every,
             "model.seed": seed,
             "seed_everything": seed,
-            "trainer.precision": "bf16-mixed",
+            "trainer.precision": LIGHTNING[resolved("auto")],
             "trainer.logger": "CSVLogger",
             "trainer.logger.save_dir": run,
             "trainer.logger.name": "log",

@@ -9,6 +9,7 @@ import pandas as pd
 
 from envtf_lit.data.cards import markdown_table
 from envtf_lit.data.sources.files import load_dataset, save_dataset
+from envtf_lit.devices import pick_device
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.horizon import THRESHOLDS
 from envtf_lit.evaluation.physics import Physics, ceiling
@@ -19,7 +20,7 @@ from envtf_lit.robots.returns import SEED_OFFSET
 from envtf_lit.robots.tasks import Task
 from envtf_lit.studies.study import Study
 from envtf_lit.studies.suite import PHYSICS, Suite, cached_result, flat_settings, load_for_study
-from envtf_lit.training import pick_device, run_folder
+from envtf_lit.training import run_folder
 from envtf_lit.world_models.forecast import Scale, Trajectories, whole_episodes
 
 ONLINE = ("random", "medium", "expert")  # policies of the zoo that drive MuJoCo

@@ -15,9 +15,9 @@ from typing import Any
 
 import torch
 
+from envtf_lit.devices import pick_device, resolved
 from envtf_lit.errors import UserError
 from envtf_lit.options.schema import Precision
-from envtf_lit.training import pick_device
 
 PACKAGES = ("torch", "lightning", "gymnasium", "mujoco", "numpy")
 
@@ -54,7 +54,7 @@ def facts(device: torch.device, precision: Precision) -> dict[str, Any]:
         **hardware(device),
         "threads": torch.get_num_threads(),
         "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
-        "precision": precision,
+        "precision": resolved(precision, device),
         "python": platform.python_version(),
         **{package: version(package) for package in PACKAGES},
     }

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from envtf_lit.data.sources.files import load_dataset, save_dataset
+from envtf_lit.devices import pick_device
 from envtf_lit.evaluation.in_context import InContextError, in_context_error, in_context_metrics, stretches
 from envtf_lit.figures.in_context import in_context_curves
 from envtf_lit.robots.tasks import Task
 from envtf_lit.studies.study import Study
 from envtf_lit.studies.suite import Suite, cached_result, flat_settings, load_for_study
-from envtf_lit.training import pick_device
 from envtf_lit.world_models.forecast import Scale
 from envtf_lit.zoo.collect import collect
 from envtf_lit.zoo.snapshots import plan

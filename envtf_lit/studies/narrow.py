@@ -18,6 +18,7 @@ from envtf_lit.agents.et_cql import ETCQLOptions
 from envtf_lit.agents.trust_levels import CLONE, TrustLevel
 from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.files import load_dataset, save_dataset
+from envtf_lit.devices import pick_device
 from envtf_lit.errors import UserError
 from envtf_lit.evaluation.horizon import horizon_report
 from envtf_lit.evaluation.metrics import held_out_metrics
@@ -37,7 +38,7 @@ from envtf_lit.robots.returns import evaluate_policy
 from envtf_lit.studies.machine import facts
 from envtf_lit.studies.narrow_logs import EPISODES, MACHINES, Machine, make_log, simulator
 from envtf_lit.studies.suite import cached_result
-from envtf_lit.training import pick_device, run_folder
+from envtf_lit.training import run_folder
 from envtf_lit.world_models.forecast import Scale, whole_episodes
 from envtf_lit.world_models.store import load_world_model
 

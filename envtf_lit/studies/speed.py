@@ -17,6 +17,7 @@ import torch
 from torch import nn
 
 from envtf_lit.actors import TanhGaussianActor
+from envtf_lit.devices import autocast, resolved
 from envtf_lit.files import write_json
 from envtf_lit.imagination.histories import Histories
 from envtf_lit.imagination.rollouts import imagine
@@ -27,7 +28,6 @@ from envtf_lit.results import claim
 from envtf_lit.robots.tasks import ROBOTS, Robot
 from envtf_lit.robots.termination import never_terminated
 from envtf_lit.studies.machine import bench_device, facts, in_turns, ratio, seconds, typical
-from envtf_lit.training import autocast
 from envtf_lit.world_models.ensemble import EnsembleDynamics
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.lit import LitWorldModel
@@ -47,7 +47,7 @@ def bench_model(
     preset: str = "small",
     robot: str = "hopper",
     device: str | None = None,
-    precision: Precision = "bf16",
+    precision: Precision = "auto",
     compile: bool = False,
     threads: int = 1,
     batch: int = 4_096,
@@ -275,7 +275,8 @@ def _matmul_size(device: torch.device) -> tuple[int, int]:
 
 def _matmul(device: torch.device, precision: Precision) -> Callable[[], float]:
     size, repeats = _matmul_size(device)
-    matrix = torch.randn(size, size, device=device, dtype={"fp32": torch.float32, "bf16": torch.bfloat16}[precision])
+    dtype = {"fp32": torch.float32, "bf16": torch.bfloat16}[resolved(precision, device)]
+    matrix = torch.randn(size, size, device=device, dtype=dtype)
 
     def run() -> None:
         for _ in range(repeats):

@@ -20,6 +20,7 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.fetch import sha256
 from envtf_lit.data.sources.files import load_dataset
+from envtf_lit.devices import pick_device
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import read_json, write_json
 from envtf_lit.options.schema import Precision, build, rebuild
@@ -29,7 +30,7 @@ from envtf_lit.pipeline.stage import CARD, DATASET, run_settings
 from envtf_lit.results import has, read_or_none, refuse_others
 from envtf_lit.robots.tasks import Robot, Task, get_task
 from envtf_lit.studies.machine import hardware
-from envtf_lit.training import pick_device, run_folder
+from envtf_lit.training import run_folder
 from envtf_lit.world_models.fit import fit_world_model
 from envtf_lit.world_models.interface import WorldModel
 from envtf_lit.world_models.options import EnsembleOptions, TransformerOptions, WorldModelOptions
@@ -67,7 +68,7 @@ class SuiteOptions:
     ensemble: EnsembleOptions = field(default_factory=EnsembleOptions)
     seed: int = 0
     threads: int = 2
-    precision: Precision = "bf16"
+    precision: Precision = "auto"
     compile: bool = False
 
 
