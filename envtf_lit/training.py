@@ -148,7 +148,6 @@ def trained(
     check_writable(run / "last.ckpt", folder=False)
     checkpoint = _checkpoint(run, ("last",) if monitor is None else ("last", "best"), module)
     curves = Curves()
-    # in front the guard: an epoch that diverged is in no checkpoint
     keepers = [Guard(), *callbacks, *_keepers(run, curves, monitor, mode)]
     trainer = L.Trainer(
         max_epochs=epochs,
@@ -164,17 +163,22 @@ def trained(
         limit_val_batches=None if validate else 0,
         gradient_clip_val=gradient_clip,
     )
+    _fit(trainer, module, data, checkpoint)
+    if monitor is not None:
+        kept = torch.load(run / "best.ckpt", map_location="cpu", weights_only=True)
+        module.load_state_dict(kept["state_dict"])
+    yield curves
+    shutil.rmtree(run, ignore_errors=True)
+
+
+def _fit(trainer: L.Trainer, module: L.LightningModule, data: L.LightningDataModule, checkpoint: Path | None) -> None:
+    """Fits from a checkpoint, if there is one; an interrupt, of which Lightning makes an end, stays one."""
     with warnings.catch_warnings():
         # Lightning's use of an older torch's name helps nobody, least of all in a notebook
         warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
-    if monitor is not None:
-        kept = torch.load(run / "best.ckpt", map_location="cpu", weights_only=True)
-        module.load_state_dict(kept["state_dict"])
-    yield curves
-    shutil.rmtree(run, ignore_errors=True)
 
 
 def _keepers(run: Path, curves: Curves, monitor: str | None, mode: Literal["min", "max"]) -> list[Callback]:

@@ -123,5 +123,7 @@ def running(hub: Hub) -> Iterator[Hub]:
         http.daemon_threads = True
         threading.Thread(target=http.serve_forever, args=(0.01,), daemon=True).start()
         hub.url = f"http://127.0.0.1:{http.server_port}"
-        yield hub
-        http.shutdown()
+        try:
+            yield hub
+        finally:
+            http.shutdown()

@@ -1,10 +1,14 @@
-"""Made-up files of a comparison, whose numbers are known."""
+"""Made-up files of a comparison, whose numbers are known; and the networks of its runs for real, which are tiny."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 from envtf_lit.comparison.budgets import Budget, budget_of
 from envtf_lit.comparison.records import DATASET, Evaluation, Run, Shared, add_run, add_shared
+from envtf_lit.pipeline.params import Params
+from envtf_lit.pipeline.yaml import preset_params
 
 BUDGET = budget_of("cpu-small")
 
@@ -58,3 +62,10 @@ def write_comparison(results: Path, runs: Iterable[Run], logs: dict[str, tuple[f
         robot, _, tier = task.partition("-")
         add_shared(results, Shared(robot, tier, str(BUDGET), DATASET, 20.0, 500.0, 100_000, 300, mean, best))
         add_shared(results, Shared(robot, tier, str(BUDGET), "transformer", 220.0, 900.0))
+
+
+@cache
+def tiny_networks(_: str) -> Params:
+    """In place of any preset of the comparison: the tiny one, with updates enough for every algorithm's phases."""
+    tiny = preset_params("tiny")
+    return replace(tiny, policy=replace(tiny.policy, updates=4_500, updates_per_epoch=500))

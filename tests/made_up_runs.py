@@ -1,5 +1,7 @@
 """Made-up outputs of the stages before the report, and what an executed notebook says of them."""
 
+import tempfile
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +88,22 @@ def some_frontier(kept: int = 2) -> Places:
 
 def made_up_run(root: Path, source: str = "file", *, simulator: bool = True) -> Path:
     """What the stages before the report write, for a policy that imagines and does worse than those from data alone."""
+    for name, content in _files(source, simulator).items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(content)
+    return root
+
+
+@cache
+def _files(source: str, simulator: bool) -> dict[Path, bytes]:
+    """The run's files, whose pictures take seconds."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        _write(root, source, simulator)
+        return {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def _write(root: Path, source: str, simulator: bool) -> None:
     data, plots = linear_data((40, 50), noise=0.02), root / "reports/plots"
     model_curves = pd.DataFrame({"epoch": [1], "train/loss": [1.0], "val/loss": [1.1], "val/open_loop_error": [0.2]})
     curves = {name: pd.DataFrame({"epoch": [1], "train/q_data": [3.0]}) for name in ("plain", "dreamer")}
@@ -116,7 +134,6 @@ def made_up_run(root: Path, source: str = "file", *, simulator: bool = True) -> 
     write_json(root / "models/world_model/small/metrics.json", found)
     write_json(root / "reports/metrics.json", metrics)
     write_json(root / "data/dataset.json", dataset_card(data, source, {"path": "my.h5", "note": "A note."}))
-    return root
 
 
 def _simulated(root: Path, data: OfflineDataset, source: str, facts: dict[str, Any]) -> dict[str, Any]:

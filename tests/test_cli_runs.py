@@ -11,7 +11,6 @@ import time
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from envtf_lit.pipeline.yaml import dump_params, load_params, params_yaml, prese
 from tests import logs
 from tests.full_disk import full_disk
 from tests.lightning_runs import NO_LOGGER, QUIET
+from tests.processes import begun
 from tests.test_cli import LIGHTNING, exit_status
 from tests.walker import walker_dataset
 
@@ -72,16 +72,16 @@ if __name__ == "__main__":
 
 def test_a_pool_does_not_hold_up_a_termination(tmp_path: Path) -> None:
     (tmp_path / "waiting.py").write_text(WAITING)
-    process = subprocess.Popen(
-        [sys.executable, "waiting.py"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None and process.stdout.readline() == "ready\n"
-    process.terminate()
-    _, errors = process.communicate(timeout=120)
+    pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    with begun([sys.executable, "waiting.py"], cwd=tmp_path, **pipes) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        process.terminate()
+        _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 143
     assert "envtf: Interrupted. The same command begins anew." in errors.splitlines()
 
 
+PATIENCE = 300.0  # seconds, within which even a machine that is busy with other things ends a process
 LISTED = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are listed there")
 
 
@@ -100,7 +100,7 @@ def is_alive(process: int) -> bool:
 
 
 def wait_until_none_lives(processes: set[int]) -> None:
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + PATIENCE
     while any(map(is_alive, processes)):
         assert time.monotonic() < deadline, "a worker is left"
         time.sleep(0.02)
@@ -123,8 +123,8 @@ if __name__ == "__main__":
 @LISTED
 def test_workers_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
     (tmp_path / "pool.py").write_text(POOL)
-    quiet: dict[str, Any] = dict(stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    with subprocess.Popen([sys.executable, "pool.py"], cwd=tmp_path, **quiet) as process:
+    quiet = dict(stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    with begun([sys.executable, "pool.py"], cwd=tmp_path, **quiet) as process:
         assert process.stdout is not None and process.stdout.readline() == "ready\n"
         workers = children(process.pid)
         assert len(workers) >= 2 and all(map(is_alive, workers))
@@ -145,13 +145,13 @@ def is_collecting(process: int) -> bool:
 def test_no_worker_outlives_a_download(number: int, project: Path) -> None:
     """Killed, it can tell them nothing; the kernel's own killer does not ask either."""
     command = [sys.executable, "-m", "envtf_lit", "download", "--quiet", "--threads=2", "--download.transitions=400000"]
-    process = subprocess.Popen(command, cwd=project, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while len(found := children(process.pid)) < 3 or not all(map(is_collecting, found)):  # two, and Python's tracker
-        assert time.monotonic() < deadline and process.poll() is None
-        time.sleep(0.05)
-    process.send_signal(number)
-    process.wait(timeout=30)
+    with begun(command, cwd=project, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        # two, and Python's tracker
+        while len(found := children(process.pid)) < 3 or not all(map(is_collecting, found)):
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(number)
+        process.wait(timeout=PATIENCE)
     wait_until_none_lives(found)
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from envtf_lit.cli.main import main
 from envtf_lit.comparison import cell as cell_module
-from envtf_lit.comparison import runner
+from envtf_lit.comparison import runner, settings
 from envtf_lit.comparison.budgets import budget_of
 from envtf_lit.comparison.cell import evaluation_seed, run_cell, section_of
 from envtf_lit.comparison.cluster import run_on_ray
@@ -28,9 +28,20 @@ from envtf_lit.policy import load_policy
 from envtf_lit.robots.returns import evaluate_policy
 from envtf_lit.robots.tasks import ROBOTS
 from tests.chores import complain, end_itself, job, sleep_and_note
+from tests.made_up_comparison import tiny_networks
+from tests.processes import begun
 
 TINY = budget_of("cpu-small", updates=30, episodes=1, transitions=2_000, model_updates=10)
+PRESET = settings._preset  # of processes of their own
 FLAGS = ["--updates", "30", "--episodes", "1", "--transitions", "2000", "--model-updates", "10"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small() -> Iterator[None]:
+    """What is trained in this process is of the tiny preset's size, whatever the budget's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(settings, "_preset", tiny_networks)
+        yield
 
 
 def cells_of(*algorithms: str, seeds: Sequence[int] = (0,)) -> list[Cell]:
@@ -216,7 +227,7 @@ def test_nothing_is_begun_over_a_damaged_file_or_with_settings_that_contradict(w
 
 
 def compare(results: Path, work: Path, *more: str) -> list[str]:
-    words = ["--robots", "hopper", "--tiers", "medium", "--kits", "same", "--seeds", "0", "--algorithms", "wbc", "cql"]
+    words = ["--robots", "hopper", "--tiers", "medium", "--kits", "same", "--seeds", "0", "--algorithms", "wbc", "iql"]
     return ["compare", "run", *words, *FLAGS, "--out", str(results), "--work", str(work), "--quiet", *more]
 
 
@@ -226,39 +237,41 @@ def test_two_algorithms_on_a_task_in_processes(work: Path, tmp_path: Path, capsy
     said = capsys.readouterr().out
     assert "0 of 2 runs are there" in said and f"--budget '{TINY}'" in said
     runs = read_records(results, Run)
-    assert {run.algorithm for run in runs} == {"wbc", "cql"}
+    assert {run.algorithm for run in runs} == {"wbc", "iql"}
     main(["compare", "report", "--results", str(results), "--out", str(tmp_path / "report")])
     assert f"2 runs of {TINY}: {tmp_path}/report/index.md" in capsys.readouterr().out
     assert (tmp_path / "report/curves_same.png").exists()
+
+
+def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
+    """Returns when a process has written a file."""
+    while not path.exists():
+        assert process.poll() is None
+        time.sleep(0.05)
 
 
 @pytest.mark.slow
 def test_a_command_that_is_killed_between_rows_is_gone_on_with(work: Path, tmp_path: Path) -> None:
     results = tmp_path / "results.csv"
     command = [sys.executable, "-m", "envtf_lit", *compare(results, work, "--workers", "1")]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    deadline = time.time() + 300
-    while not results.exists() and time.time() < deadline:
-        time.sleep(0.05)
-    process.kill()
-    process.wait()
+    with begun(command, stdout=subprocess.DEVNULL) as process:
+        wait_for(results, process)
+        process.kill()
     (first,) = read_records(results, Run)
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert "1 of 2 runs are there" in said and f"{first.algorithm} (same" not in said
     assert first in [run for run in read_records(results, Run) if run.algorithm == first.algorithm]
-    assert {run.algorithm for run in read_records(results, Run)} == {"wbc", "cql"}
+    assert {run.algorithm for run in read_records(results, Run)} == {"wbc", "iql"}
 
 
 @pytest.mark.slow
 def test_an_interrupted_command_keeps_its_rows_and_says_so(work: Path, tmp_path: Path) -> None:
     results = tmp_path / "results.csv"
     command = [sys.executable, "-m", "envtf_lit", *compare(results, work, "--workers", "1")]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    deadline = time.time() + 300
-    while not results.exists() and time.time() < deadline:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    with begun(command, stderr=subprocess.PIPE) as process:
+        wait_for(results, process)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=300)
     assert process.returncode == 130
     assert "The same command goes on with the runs that are not finished." in " ".join(said.split())
     assert len(read_records(results, Run)) == 1
@@ -275,12 +288,15 @@ def test_without_ray_its_extra_is_named(tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # Ray's own
-def test_a_local_cluster_of_two_workers_does_the_same(work: Path, tmp_path: Path) -> None:
+def test_a_local_cluster_of_two_workers_does_the_same(
+    work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("ray")
     results, said = tmp_path / "results.csv", list[str]()
     cells = cells_of("wbc", "cql")
     runs = run_grid(cells, results, work=work, workers=2, ray_address="local", progress=False, report=said.append)
     assert {run.algorithm for run in runs} == {"wbc", "cql"}
+    monkeypatch.setattr(settings, "_preset", PRESET)
     alone = [run_cell(cell, work)[0].score_final for cell in cells]
     assert [run.score_final for run in sorted(runs, key=lambda run: run.algorithm != "wbc")] == alone
     jobs = [

@@ -20,6 +20,7 @@ from envtf_lit.errors import UserError
 from envtf_lit.files import recover, replacing, write_json, write_text
 from envtf_lit.policy import load_policy, save_policy
 from tests.full_disk import full_disk
+from tests.processes import begun
 from tests.walker import walker_dataset
 
 
@@ -201,14 +202,13 @@ def test_what_a_process_still_writes_is_left_alone(tmp_path: Path) -> None:
         assert first.read_text() == "first"
     assert (tmp_path / "file").read_text() == "first"
     name = re.sub(r"-\d+-", "-{}-", first.name)
-    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-    left = tmp_path / name.format(child.pid)
-    left.write_text("half")
-    foreign = tmp_path / re.sub(r"\w+-\{\}", "ffffffff-1", name)
-    foreign.write_text("half")
-    write_text(tmp_path / "file", "third")
-    assert left.exists() and foreign.exists()
-    child.communicate(b"\n")
+    with begun([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        left = tmp_path / name.format(child.pid)
+        left.write_text("half")
+        foreign = tmp_path / re.sub(r"\w+-\{\}", "ffffffff-1", name)
+        foreign.write_text("half")
+        write_text(tmp_path / "file", "third")
+        assert left.exists() and foreign.exists()
     write_text(tmp_path / "file", "fourth")
     assert sorted(tmp_path.iterdir()) == sorted([foreign, tmp_path / "file"])
 

@@ -1,6 +1,7 @@
 """From the last update to the published folder: no training is lost there, nor for a checkpoint that is damaged."""
 
 import errno
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,32 @@ from tests.test_training import (
 def root(tmp_path: Path) -> Path:
     save_dataset(LOG, tmp_path / "data/dataset.h5")
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What a training that nothing disturbs publishes, wherever its project lies."""
+    folder = tmp_path_factory.mktemp("whole")
+    save_dataset(LOG, folder / "data/dataset.h5")
+    return train_whole(folder)
+
+
+@pytest.fixture(scope="module")
+def killed_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project whose training was killed in its third epoch."""
+    folder = tmp_path_factory.mktemp("killed")
+    save_dataset(LOG, folder / "data/dataset.h5")
+    with pytest.MonkeyPatch.context() as patch:
+        killed_run(folder, patch)
+    return folder
+
+
+@pytest.fixture
+def run(killed_once: Path, tmp_path: Path) -> Path:
+    """The killed run in a copy of that project, which is `tmp_path`."""
+    shutil.copytree(killed_once, tmp_path, dirs_exist_ok=True)
+    (found,) = (tmp_path / ".envtf/runs").iterdir()
+    return found
 
 
 ENSEMBLE = EnsembleOptions(
@@ -180,38 +207,35 @@ DAMAGES = [(name, damage) for damage in (torn, empty, never_written, another_fil
 
 
 @pytest.mark.parametrize(("name", "damage"), [*DAMAGES, ("best", Path.unlink)])
-def test_a_damaged_checkpoint_is_set_aside_and_training_starts_anew(root, monkeypatch, capsys, name, damage):
-    expected = train_whole(root)
-    run = killed_run(root, monkeypatch)
+def test_a_damaged_checkpoint_is_set_aside_and_training_starts_anew(
+    run, tmp_path, expected, monkeypatch, capsys, name, damage
+):
     damage(run / f"{name}.ckpt")
     capsys.readouterr()
     with monkeypatch.context() as patch:
         kill_in_epoch(patch, 0)
         with pytest.raises(Killed):
-            train_whole(root)
+            train_whole(tmp_path)
     aside = {"last.ckpt.unreadable", "best.ckpt.unreadable"} - (
         {"best.ckpt.unreadable"} if damage is Path.unlink else set()
     )
     assert {path.name for path in run.iterdir()} == aside
-    assert train_whole(root) == expected and not run.exists()
+    assert train_whole(tmp_path) == expected and not run.exists()
     (sentence,) = capsys.readouterr().err.strip().splitlines()
     assert f"{name}.ckpt is damaged or missing" in sentence and "training starts anew" in sentence
 
 
-def test_a_checkpoint_of_another_version_is_set_aside(root, monkeypatch, capsys):
-    expected = train_whole(root)
-    run = killed_run(root, monkeypatch)
+def test_a_checkpoint_of_another_version_is_set_aside(run, tmp_path, expected, capsys):
     saved = torch.load(run / "last.ckpt", weights_only=True)
     saved["state_dict"]["horizon"] = torch.zeros(3)
     torch.save(saved, run / "last.ckpt")
     capsys.readouterr()
-    assert train_whole(root) == expected
+    assert train_whole(tmp_path) == expected
     (sentence,) = capsys.readouterr().err.strip().splitlines()
     assert "last.ckpt holds other weights than this version trains" in sentence and "anew" in sentence
 
 
-def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(root, monkeypatch):
-    expected = train_whole(root)
+def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(root, expected, monkeypatch):
     synced: list[int] = []
 
     def sync(file: int) -> None:

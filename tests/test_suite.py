@@ -25,7 +25,7 @@ TINY = SuiteOptions(transitions=1_000, updates=2, ensemble=ENSEMBLE, threads=1)
 
 @pytest.mark.filterwarnings("ignore:.*treespec, LeafSpec:FutureWarning")
 def test_a_suite_is_trained_once_and_what_changed_is_trained_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_models: None
 ) -> None:
     suite = build_suite("hopper-medium", tmp_path, TINY, progress=False)
     assert tuple(suite.folders) == MODELS == tuple(suite.seconds)

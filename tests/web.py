@@ -80,5 +80,7 @@ def serving(server: Server) -> Iterator[Server]:
     with _Patient(("127.0.0.1", 0), _handler(server)) as http:
         threading.Thread(target=http.serve_forever, args=(0.01,), daemon=True).start()
         server.url = f"http://127.0.0.1:{http.server_port}/some.hdf5"
-        yield server
-        http.shutdown()
+        try:
+            yield server
+        finally:
+            http.shutdown()

@@ -18,6 +18,7 @@ from envtf_lit.data.findings import Finding
 from envtf_lit.data.outliers import wild_values
 from envtf_lit.data.sources.local import open_source
 from envtf_lit.data.sources.raw import ALIASES, Raw
+from envtf_lit.data.sources.tables import TABLE_ALIASES
 from envtf_lit.data.statistics import CONSTANT
 from envtf_lit.errors import UserError
 from envtf_lit.robots.tasks import get_task
@@ -26,14 +27,15 @@ STYLES = {"error": "bold red", "warning": "yellow", "note": "cyan"}  # the grave
 BARS = 10  # of the histogram of returns
 MIXER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: odd, and without pattern
 HUGE = 1e8  # a magnitude that float32 arithmetic, which squares, does not go well with
-# what others call a column, in the singular
-USUAL = {
-    **dict.fromkeys(("ob", "observation", "state"), "observations"),
-    **dict.fromkeys(("act", "action"), "actions"),
-    **dict.fromkeys(("rew", "reward"), "rewards"),
-    **dict.fromkeys(("next_ob", "next_observation", "next_state"), "next_observations"),
-    **dict.fromkeys(("done", "terminal", "termination"), "terminated"),
-    **dict.fromkeys(("timeout", "truncation"), "truncated"),
+# what others call a column, in the singular: names that tables are read by, and some that nothing is read by
+USUAL = {name.removesuffix("s"): ours for ours, names in TABLE_ALIASES.items() for name in names} | {
+    "ob": "observations",
+    "act": "actions",
+    "rew": "rewards",
+    "next_ob": "next_observations",
+    "done": "terminated",
+    "termination": "terminated",
+    "truncation": "truncated",
 }
 SEAM = 1e-3  # of a dimension's standard deviation: more between s' and the next row's s is a gap
 

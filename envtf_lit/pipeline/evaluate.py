@@ -99,12 +99,8 @@ def evaluate(params: Params, root: Path = Path("."), *, progress: bool = True) -
                 real_vs_imagined(model, episode, robot, scale, gif, frames=options.video_frames)
                 ghost_over_real(model, episode, robot, scale, video / "ghost.gif", frames=options.video_frames)
             gallery.draw_frontiers(frontiers, metrics["held_out"], dataset, source, _labels(params), measured, plots)
-        for policy, options in params.train_policy.items():
-            imagined_in = None if options.world_model == NO_WORLD_MODEL else options.world_model
-            metrics["policies"][policy] |= {"algorithm": algorithm_of(options), "world_model": imagined_in}
-            metrics["policies"][policy]["effective_episodes"] = _last(curves[policy], EFFECTIVE)
-            if (clone := measured.get(f"{policy}/{CLONE}")) is not None:
-                metrics["policies"][policy] |= {"clone_return_mean": clone}
+        for policy in policies:
+            metrics["policies"][policy] |= _training_facts(policy, params, curves[policy], measured)
         write_json(root / METRICS, metrics)
     return metrics
 
@@ -116,6 +112,16 @@ def _play(policies: Mapping[str, Policy], params: Params, robot: Robot, progress
         name: evaluate_policy(actor, robot, episodes=episodes, seed=params.seed, progress=progress)
         for name, actor in policies.items()
     }
+
+
+def _training_facts(policy: str, params: Params, curves: pd.DataFrame, measured: Mapping[str, float]) -> dict[str, Any]:
+    """How a policy was made, and the mean return of its clone where that was measured."""
+    options, clone = params.train_policy[policy], measured.get(f"{policy}/{CLONE}")
+    return {
+        "algorithm": algorithm_of(options),
+        "world_model": None if options.world_model == NO_WORLD_MODEL else options.world_model,
+        "effective_episodes": _last(curves, EFFECTIVE),
+    } | ({} if clone is None else {"clone_return_mean": clone})
 
 
 def _mean(found: Returns) -> float:

@@ -6,6 +6,7 @@ from typing import Any
 
 from lightning.pytorch.callbacks import Callback
 
+from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.combo import MixingOptions
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.registry import ALGORITHMS
@@ -27,7 +28,7 @@ from envtf_lit.pipeline.stage import (
     unseen,
 )
 from envtf_lit.progress import note
-from envtf_lit.training import run_folder, trained
+from envtf_lit.training import Curves, run_folder, trained
 from envtf_lit.world_models.fit import REACH, known_reach
 from envtf_lit.world_models.observed import as_observed
 from envtf_lit.world_models.store import load_world_model
@@ -90,16 +91,20 @@ def train_policy(
             validate=False,
             callbacks=callbacks,
         ) as curves:
-            return publish_policy(
-                target,
-                agent.average_actor,
-                curves,
-                curves.rows[-1],
-                settings,
-                critics=agent.published_critics(),
-                records=agent.records(),
-                companions=agent.companions(),
-            )
+            return _publish(target, agent, curves, settings)
+
+
+def _publish(target: Path, agent: Agent, curves: Curves, settings: dict[str, Any]) -> dict[str, Any]:
+    return publish_policy(
+        target,
+        agent.average_actor,
+        curves,
+        curves.rows[-1],
+        settings,
+        critics=agent.published_critics(),
+        records=agent.records(),
+        companions=agent.companions(),
+    )
 
 
 def within_reach(options: MixingOptions, model: Path) -> MixingOptions:
