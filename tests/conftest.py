@@ -58,14 +58,6 @@ def small_models(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Notebooks are executed in processes that begin with the package imported."""
-    from tests import warm
-
-    monkeypatch.setattr("jupyter_client.provisioning.local_provisioner.launch_kernel", warm.launch_kernel)
-
-
-@pytest.fixture
 def minari_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a test's Minari datasets."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))

@@ -183,7 +183,6 @@ def test_text_and_code_take_turns(name: str):
     assert kinds == ["markdown", "code"] * (len(kinds) // 2) + ["markdown"] * (len(kinds) % 2)
 
 
-@pytest.mark.usefixtures("warm_kernels")
 def test_the_report_has_the_same_bytes_every_time_and_needs_no_network(lost: Run):
     written = []
     for _ in range(2):
@@ -199,7 +198,6 @@ def test_the_report_has_the_same_bytes_every_time_and_needs_no_network(lost: Run
     assert "No description" not in html
 
 
-@pytest.mark.usefixtures("warm_kernels")
 def test_the_report_without_a_simulator(offline: Run):
     source, output = NOTEBOOKS / "report_offline.ipynb", offline.root / "reports/report.ipynb"
     beside = offline.root / "notebooks"  # where JupyterLab starts the kernel

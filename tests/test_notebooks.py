@@ -18,7 +18,6 @@ from envtf_lit.project.tutorials import TINY, run_tutorial, tiny_parameters
 
 TYPES = ("bool", "float", "int", "str")
 named = pytest.mark.parametrize("name", NAMES)
-warm = pytest.mark.usefixtures("warm_kernels")
 
 
 # how they are cut
@@ -85,7 +84,6 @@ def test_it_checks_itself_and_has_exercises_with_solutions(name: str) -> None:
 
 
 @named
-@warm
 def test_it_runs_at_its_tiny_size_with_its_solutions(name: str, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     parameters = tiny_parameters(name, NOTEBOOKS) | {"folder": str(tmp_path / "work")}
@@ -135,7 +133,6 @@ def read_results(tmp_path: Path, runs: list[Run], kit: str) -> str:
     return said
 
 
-@warm
 def test_results_of_several_seeds_have_intervals_and_verdicts(tmp_path: Path) -> None:
     levels = {"wbc": 30.0, "cql": 50.0, "et_cql": 70.0}
     runs = [
@@ -152,7 +149,6 @@ def test_results_of_several_seeds_have_intervals_and_verdicts(tmp_path: Path) ->
     assert "Those made above stand in" not in said
 
 
-@warm
 def test_a_single_run_has_no_interval_and_leaves_all_open(tmp_path: Path) -> None:
     said = read_results(tmp_path, [some_run("ant-medium", "et_cql_paper", 40.0, kit="published")], "published")
     assert "on 1 of 20 tasks" in said and "No cell has an interval: each has one seed" in said
@@ -161,7 +157,6 @@ def test_a_single_run_has_no_interval_and_leaves_all_open(tmp_path: Path) -> Non
     assert "0 of 1 tasks" in said and "`envtf compare run --kits published --seeds 0 1 2`" in said
 
 
-@warm
 def test_without_results_it_says_which_command_makes_them(tmp_path: Path) -> None:
     said = read_results(tmp_path, [some_run("ant-medium", "cql", 40.0)], "published")
     assert "No runs of the kit `published` yet: `envtf compare run --kits published` makes them." in said
