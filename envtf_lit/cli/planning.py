@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from envtf_lit.cli.output import console, hush_lightning
 from envtf_lit.cli.signatures import CORES, File, Folder, Natural, Positive, run_command
@@ -74,18 +74,19 @@ def plan(
     import torch
 
     from envtf_lit.evaluation.planning import robot_to_plan_for, score_planner
+    from envtf_lit.files import write_json
     from envtf_lit.results import claim
 
     if out is not None:
         claim(out, "decisions_per_second")
     torch.set_num_threads(threads)
     robot = robot_to_plan_for(world_model, task, dataset, steps=played.steps)
-    wishes = dict(policy=policy, critics=not no_critics, progress=not quiet)
+    wishes: dict[str, Any] = dict(policy=policy, critics=not no_critics, progress=not quiet)
     found = score_planner(world_model, robot, planner, option, **asdict(played), **wishes)
     _print_scores(found, planner, policy, imagined=task is None)
     if out is not None:
         asked = dict(task=task, planner=planner, options=list(option), seed=played.seed, threads=threads)
-        _write(out, asked | dict(precision=played.precision), found)
+        write_json(out, asked | dict(precision=played.precision) | _rates(found))
     if video is not None and dataset is not None:
         _draw(found, world_model, robot, dataset, video)
 
@@ -101,12 +102,6 @@ def _check_places(task: str | None, dataset: Path | None, video: Path | None) ->
         raise UserError("--video tells the model's error in units of its data: name them with --dataset FILE.")
     if video is not None and task is None:
         raise UserError("--video shows MuJoCo beside the model: name a --task whose robot it draws.")
-
-
-def _write(out: Path, asked: dict[str, object], found: "PlannedReturns") -> None:
-    from envtf_lit.files import write_json
-
-    write_json(out, asked | _rates(found))
 
 
 def _rates(found: "PlannedReturns") -> dict[str, object]:

@@ -30,6 +30,7 @@ FOLDED = f"""{OFFLINE}
 <details style="margin-left: 64px; color: gray"><summary>code</summary>{{{{ super() }}}}</details>
 {{%- endblock input_group -%}}
 """
+START = 300  # seconds that a kernel may take to begin: more than a minute on a busy machine
 KERNEL = {"name": "python3", "display_name": "Python 3", "language": "python"}
 
 
@@ -84,6 +85,7 @@ def execute(
             kernel_manager_class=OwnKernel,
             progress_bar=progress,
             cwd=str(cwd),
+            start_timeout=START,
             extra_arguments=["--IPKernelApp.log_level=ERROR"],  # it warns of its own loopback connection
         )
     except PapermillExecutionError as error:
