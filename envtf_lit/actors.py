@@ -41,7 +41,8 @@ def in_fp32(layer: nn.Module, x: Tensor) -> Tensor:
 def in_kind(
     act: Callable[[Tensor], Tensor], observation: Tensor | ArrayLike, device: torch.device
 ) -> Tensor | np.ndarray:
-    """Actions for what was seen: a tensor of its precision for a tensor, an array (float32) for an array or lists.
+    """Actions for what was seen: a tensor for a tensor, float64 for float64 and else float32; an array (float32) for an
+    array or lists.
 
     Args:
         act: of tensors in single precision or less.

@@ -6,6 +6,8 @@ import torch
 
 from envtf_lit.options.schema import Precision
 
+BF16 = "avx512_bf16", "amx_bf16", "bf16", "sve_bf16"  # capabilities of a CPU; the last two are Arm's
+
 
 def pick_device() -> torch.device:
     """The accelerator if there is one, else the CPU."""
@@ -17,10 +19,10 @@ def pick_device() -> torch.device:
 
 
 def multiplies_bf16(device: torch.device) -> bool:
-    """Whether the device has instructions for matrix products in bf16; others emulate them, slowly."""
+    """Whether the device is known to have instructions for matrix products in bf16; others may emulate them, slowly."""
     if device.type == "cpu":
         able = torch.cpu.get_capabilities()
-        return any(able.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
+        return any(able.get(name, False) for name in BF16)
     supported = getattr(torch.get_device_module(device), "is_bf16_supported", None)
     return supported is not None and supported(including_emulation=False)
 

@@ -250,7 +250,7 @@ def _checked(precision: Precision) -> Literal["fp32", "bf16"]:
     """As `resolved`; says so where it will be slow."""
     device = pick_device()
     if precision == "bf16" and not multiplies_bf16(device):
-        note(f"bf16 is emulated on this {device.type}, many times slower than fp32: take precision: auto.")
+        note(f"This {device.type} is not known to multiply bf16, and may emulate it slowly: take precision: auto.")
     return resolved(precision, device)
 
 

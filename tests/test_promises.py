@@ -168,6 +168,11 @@ def test_it_says_what_to_try_first_and_what_before(offline: Run) -> None:
     assert "**Try first ET + CQL** (`trust: default`)" in text
     assert "try `trust: cautious`" in text and "was promised 334 to 366" in text
     assert "cautious" not in promises.first_to_try(changed(offline, some_frontier(1)))
+    risky = some_frontier()
+    risky[2]["low"] = -50.0  # of single episodes; the log's mean is compared with the mean
+    text = promises.first_to_try(changed(offline, risky))
+    assert "**Try first ET + CQL**" in text and "promised mean, 390 to 450, lies above the 320" in text
+    assert "any single episode of its range, -70 to 450" in text
     text = promises.first_to_try(changed(offline, recorded=400.0))  # within the range
     assert "**Try first what is nearest to the log**: the clone in `models/policy/dreamer/clone`" in text
     assert "Try first ET" not in text

@@ -310,3 +310,10 @@ def test_contradicting_options_are_named(changed, words):
     with pytest.raises(UserError, match=r"^train_policy\.mine\.") as error:
         build_params({"train_policy": {"bc": bc, "mine": section}})
     assert all(word in str(error.value) for word in words)
+
+
+def test_without_a_warm_start_distance_is_from_the_actor_that_it_began_with() -> None:
+    agent = make_agent()
+    agent.update(log_batch())
+    assert torch.equal(flat(agent.trust.clone.state_dict()), flat(agent.frontier.actors[0].state_dict()))
+    assert float(agent.frontier.table[0, 1]) == pytest.approx(0.0, abs=1e-6)

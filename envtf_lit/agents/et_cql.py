@@ -23,7 +23,7 @@ from envtf_lit.critics import Critics
 from envtf_lit.data.datamodules import TransitionData
 from envtf_lit.errors import UserError
 from envtf_lit.imagination.options import RolloutOptions
-from envtf_lit.options.numbers import Count, Natural, NonNegative, NonzeroShare, Positive
+from envtf_lit.options.numbers import Count, Natural, NonNegative, NonzeroShare, Positive, Sharpness
 from envtf_lit.options.schema import rare
 
 
@@ -71,8 +71,9 @@ class ETCQLOptions(MixingOptions, ConservativeOptions):
     Attributes:
         trust: how far the policy may leave what the log supports: `cautious`, `default`, or `bold`, which is for those
             who can try it in a simulator (`trust_levels.LEVELS`).
-        beta: by which advantages over the log, in units of their root mean square, are multiplied in the weights
-            exp(beta A) of the rows that are cloned; 0 clones all alike.
+        beta: how much better rows are cloned more: with weights min(exp(beta A), 20), A a row's advantage over the log
+            in units of its root mean square; 0 clones all alike, for logs of one noisy controller, whose better rows
+            are lucky ones. Where states decide the log's actions it does nothing.
         critic_updates: before the value gradient, in which critics learn the clone's value on real rows and on those of
             `generate_rollouts`. All updates before are the warm start, whatever the common `warm_start` says.
         value_gradient: the end of the training, in which the actor follows the gradient through the world model.
@@ -83,7 +84,7 @@ class ETCQLOptions(MixingOptions, ConservativeOptions):
     real_ratio: NonzeroShare = 0.5
     refresh_every: Natural = rare(0)
     trust: TrustLevel = "default"
-    beta: NonNegative = rare(2.0)
+    beta: Sharpness = 2.0
     critic_updates: Natural = 1_000
     rollouts: GuardedRolloutOptions = field(default_factory=GuardedRolloutOptions)
     value_gradient: ValueGradientOptions = field(default_factory=ValueGradientOptions)
@@ -122,6 +123,9 @@ class ETCQL(AdvantageWeights, COMBO):
     A clone of the better rows, stopped by held-out likelihood; critics that learn its conservative Q (COMBO's form) on
     real rows and on those of `generate_rollouts`; then `ValueGradient`: the actor climbs imagined returns that end in
     that Q, which goes on learning, under a constraint on its held-out likelihood.
+
+    In the warm start critics fit returns that go on beyond truncations with the log's own value V, which the weights of
+    better rows need, and not with target critics, as other actor-critics' do.
     """
 
     Options: ClassVar[type[PolicyOptions]] = ETCQLOptions

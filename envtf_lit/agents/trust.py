@@ -24,7 +24,7 @@ DETERMINED = 0.1  # of held-out actions' variance: a clone that leaves less unex
 class Trust(nn.Module):
     """The constraint `E[-w log pi(a|s)] / A <= that of the best clone + slack`, over rows that nothing learns from.
 
-    The weights w are those that the clone learned with.
+    The weights w, divided by their sum, are by the same rule as those that the clone learned with.
 
     The weight of the actor's clone loss is its dual variable: it grows while the constraint is broken and shrinks while
     it is not (dual ascent, as SAC's temperature: Haarnoja et al. 2018, section 5).
@@ -37,6 +37,8 @@ class Trust(nn.Module):
         best: (), its error there (`Actor.clone_error`).
         determined: () bool, whether some look found that the log's actions are a function of its states.
         rows: to watch; None before there is a log.
+        weigh: rows to their weights (B,), as they are at the moment.
+        looked_at: the rows of each look.
     """
 
     best: Tensor

@@ -200,6 +200,8 @@ class ValueGradient(Phase):
         with torch.autocast(agent.device.type, enabled=False):  # errors of bf16 would add up along the path
             if done == 0:
                 agent.actor.load_state_dict(agent.average_actor.state_dict())
+                if not agent.trust.best.isfinite():  # no warm start: what it begins with stands for the clone
+                    agent.trust.look(agent.average_actor)
                 self.ask(agent, agent.average_actor, 0)
             paths = self.paths.next(agent.actor, agent.return_scale, agent.generator)
             logs = self.actor_step(agent, paths, batch, done) | self.critic_steps(agent, paths, batch)

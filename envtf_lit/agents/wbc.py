@@ -11,7 +11,7 @@ from envtf_lit.agents.agent import Agent
 from envtf_lit.agents.networks import PlainStateValue
 from envtf_lit.agents.options import PolicyOptions
 from envtf_lit.agents.phases import Batch, Logs, Part
-from envtf_lit.options.numbers import NonNegative
+from envtf_lit.options.numbers import Sharpness
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class WBCOptions(PolicyOptions):
             clones all rows alike.
     """
 
-    beta: NonNegative = 1.0
+    beta: Sharpness = 1.0
 
 
 class WBC(AdvantageWeights, Agent):

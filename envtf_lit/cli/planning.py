@@ -73,20 +73,24 @@ def plan(
     _check_places(task, dataset, video)
     import torch
 
+    from envtf_lit.devices import resolved
     from envtf_lit.evaluation.planning import robot_to_plan_for, score_planner
     from envtf_lit.files import write_json
     from envtf_lit.results import claim
+    from envtf_lit.robots.tasks import ROBOTS
 
     if out is not None:
         claim(out, "decisions_per_second")
     torch.set_num_threads(threads)
     robot = robot_to_plan_for(world_model, task, dataset, steps=played.steps)
+    if video is not None and robot.name not in ROBOTS:
+        raise UserError(f"--video draws the robots of the tasks, and {robot.name} is none of them: leave it out.")
     wishes: dict[str, Any] = dict(policy=policy, critics=not no_critics, progress=not quiet)
     found = score_planner(world_model, robot, planner, option, **asdict(played), **wishes)
     _print_scores(found, planner, policy, imagined=task is None)
     if out is not None:
         asked = dict(task=task, planner=planner, options=list(option), seed=played.seed, threads=threads)
-        write_json(out, asked | dict(precision=played.precision) | _rates(found))
+        write_json(out, asked | dict(precision=resolved(played.precision, torch.device("cpu"))) | _rates(found))
     if video is not None and dataset is not None:
         _draw(found, world_model, robot, dataset, video)
 
@@ -133,12 +137,9 @@ def _print_scores(found: "PlannedReturns", planner: str, policy: Path | None, *,
 def _draw(found: "PlannedReturns", world_model: Path, robot: "Robot", dataset: Path, video: Path) -> None:
     from envtf_lit.data.sources.files import load_dataset
     from envtf_lit.figures.video import real_vs_imagined
-    from envtf_lit.robots.tasks import ROBOTS
     from envtf_lit.world_models.forecast import Scale
     from envtf_lit.world_models.store import load_world_model
 
-    if robot.name not in ROBOTS:
-        raise UserError(f"--video draws the robots of the tasks, and {robot.name} is none of them: leave it out.")
     scale = Scale.of(load_dataset(dataset))
     real_vs_imagined(load_world_model(world_model), found.planned.median, robot, scale, video)
 

@@ -7,10 +7,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from envtf_lit.agents.trust_levels import CLONE, LEVELS
-from envtf_lit.evaluation.promises import Places, kept, promised_range
+from envtf_lit.evaluation.promises import ERRORS, Places, kept, promised_range
 from envtf_lit.figures.style import COLOURS, drawing, policy_colours, write_table
-
-ERRORS = 2.0  # standard errors of the mean that a bar reaches to either side
 
 
 def frontier_picture(

@@ -3,7 +3,7 @@
 import pandas as pd
 
 from envtf_lit.agents.trust_levels import CLONE, LEAST_GAIN, LEVELS
-from envtf_lit.evaluation.promises import Range, kept, promised_range
+from envtf_lit.evaluation.promises import Range, kept, mean_range, promised_range
 from envtf_lit.figures.report import Run
 
 NEAR = LEVELS["cautious"].slack  # nats from the clone within which a policy is near the log
@@ -100,20 +100,21 @@ def first_to_try(run: Run) -> str:
         return ""
     ordered = sorted(run.frontiers, key=lambda name: kept(run.frontiers[name])["excess"])
     promises = {name: promised_range(kept(run.frontiers[name]), run.held_out) for name in ordered}
-    sure = [name for name in ordered if promises[name].low > run.recorded_return]
+    means = {name: mean_range(kept(run.frontiers[name]), run.held_out) for name in ordered}
+    sure = [name for name in ordered if means[name].low > run.recorded_return]
     name = sure[0] if sure else ordered[0]
     warnings = [_beyond(run, each) for each in ordered]
     if not sure:
         words = (
             f"**Try first what is nearest to the log**: the clone in `models/policy/{name}/{CLONE}`, or what made the "
-            f"log. No policy's range lies above the {_return(run.recorded_return)} that the log's mean episode earned; "
-            f"{run.label(name)} is promised {_words(promises[name])}."
+            f"log. No policy's mean is promised to lie above the {_return(run.recorded_return)} that the log's mean "
+            f"episode earned; {run.label(name)}'s is promised at {_words(means[name])}."
         )
     else:
         words = (
             f"**Try first {run.label(name)}** (`trust: {run.trust(name)}`), the nearest to the log of those whose "
-            f"whole range, {_words(promises[name])}, lies above the {_return(run.recorded_return)} that the log's "
-            "mean episode earned."
+            f"promised mean, {_words(means[name])}, lies above the {_return(run.recorded_return)} that the log's mean "
+            f"episode earned. Be ready for any single episode of its range, {_words(promises[name])}."
         )
     return _joined(words, _before(run, name) if sure else "", *warnings)
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # a type checker sees plain numbers
     Count = Natural = Rows = Frames = int
-    Positive = NonNegative = Share = InnerShare = NonzeroShare = float
+    Positive = NonNegative = Share = InnerShare = NonzeroShare = Sharpness = float
 else:
     from jsonargparse.typing import (
         NonNegativeFloat,
@@ -21,6 +21,7 @@ else:
     Positive, NonNegative, InnerShare = PositiveFloat, NonNegativeFloat, OpenUnitInterval
     Share = restricted_number_type("Share", float, [(">=", 0), ("<", 1)])
     NonzeroShare = restricted_number_type("NonzeroShare", float, [(">", 0), ("<=", 1)])
+    Sharpness = restricted_number_type("Sharpness", float, [(">=", 0), ("<=", 50)])  # exp(-it) is no zero in fp32
 
 __all__ = [
     "Count",
@@ -32,4 +33,5 @@ __all__ = [
     "Positive",
     "Rows",
     "Share",
+    "Sharpness",
 ]

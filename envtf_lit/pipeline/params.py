@@ -65,7 +65,8 @@ class Params:
         seed: of everything random.
         threads: CPU threads of each stage; part of what makes results equal to the bit.
         precision: of matrix products in training and imagination; losses and optimisers stay in fp32. `auto` is bf16
-            where the device multiplies it natively, else fp32: on a CPU that cannot, bf16 takes fifty times as long.
+            where the device multiplies it natively, else fp32: numbers differ between such machines, so write which one
+            to repeat another's.
         compile: world models train and imagine through torch.compile, which takes a minute to begin with: pays on a
             GPU, where launching their many small operations is what takes the time.
         download: the dataset.

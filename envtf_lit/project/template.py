@@ -62,7 +62,7 @@ def write_project(folder: Path, preset: str, data: Path | None = None) -> list[s
 
 def _of_own_robot(params: Params, folder: Path, data: Path) -> Params:
     """The options with a log of one's own, at its place as seen from the project."""
-    path = os.path.relpath(os.path.realpath(data.expanduser()), os.path.realpath(folder))
+    path = os.path.relpath(os.path.abspath(data.expanduser()), os.path.realpath(folder))
     return replace(params, task=None, download=DownloadOptions(source="file", path=path))
 
 

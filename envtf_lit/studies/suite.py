@@ -20,7 +20,7 @@ from envtf_lit.data.dataset import OfflineDataset
 from envtf_lit.data.options import DownloadOptions
 from envtf_lit.data.sources.fetch import sha256
 from envtf_lit.data.sources.files import load_dataset
-from envtf_lit.devices import pick_device
+from envtf_lit.devices import pick_device, resolved
 from envtf_lit.errors import UserError, did_you_mean
 from envtf_lit.files import read_json, write_json
 from envtf_lit.options.schema import Precision, build, rebuild
@@ -124,6 +124,7 @@ def flat_settings(tier: str, options: SuiteOptions, **measured: Any) -> dict[str
     return {
         "tier": tier,
         **{f"suite.{name}": getattr(options, name) for name in kept},
+        "suite.precision": resolved(options.precision),
         **{f"{prefix}.{name}": value for prefix, what in measured.items() for name, value in asdict(what).items()},
         **{f"versions.{name}": version(name) for name in ("gymnasium", "mujoco", "numpy", "torch")},
     }
