@@ -59,6 +59,11 @@ def test_a_world_model_says_what_does_not_fit(name: str) -> None:
         ((seen, done[:, :2], [3]), r"\(1,\) lengths for 2 rollouts"),
         ((seen, done[:, :2], [0, 4]), r"histories of \[0, 4\] observations, and its windows have 3"),
         (([[[1.0] * S], [[2.0]]], done[:, :0], [1, 1]), "observations that make no array of numbers"),
+        ((seen, done[:, :2], [3, [1, 2]]), r"lengths \[3, \[1, 2\]\]: give whole numbers"),
+        ((seen, done[:, :2], None), "lengths None: give whole numbers"),
+        ((seen, done[:, :2], [2.7, 1.0]), r"lengths \[2.7, 1.0\]: give whole numbers"),
+        ((seen, done[:, :2], [3, 3], [0, 2]), r"windows \[0, 2\] of 2: they are numbered from 0"),
+        ((seen[:, :0], done[:, :0], [1, 1]), "histories of no observations: each ends with the present one"),
     ):
         with pytest.raises(UserError, match=words):
             model.init(*given)

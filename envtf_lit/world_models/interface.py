@@ -146,7 +146,7 @@ def as_histories(
     observations: Tensor | ArrayLike,
     actions: Tensor | ArrayLike,
     lengths: Tensor | ArrayLike,
-    window: Tensor | None,
+    window: Tensor | ArrayLike | None,
     sizes: tuple[int, int],
     device: torch.device,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -162,10 +162,11 @@ def as_histories(
     """
     observations = as_rows("observations", observations, (None, None, sizes[0]), device)
     W, T = observations.shape[:2]
+    if T == 0:
+        raise UserError("The world model was given histories of no observations: each ends with the present one.")
     actions = as_rows("actions between them", actions, (W, T - 1, sizes[1]), device)
-    if not isinstance(lengths, Tensor):
-        lengths = torch.from_numpy(np.array(lengths, np.int64)).to(device)
-    window = torch.arange(W, device=lengths.device) if window is None else window
+    lengths = _whole("lengths", lengths, device)
+    window = torch.arange(W, device=lengths.device) if window is None else _whole("windows", window, device)
     if lengths.shape != window.shape:
         raise UserError(
             f"The world model was given {tuple(lengths.shape)} lengths for {len(window)} rollouts: give one number for "
@@ -177,4 +178,17 @@ def as_histories(
             f"The world model was given histories of {lengths.tolist()} observations, and its windows have {T}: a "
             f"rollout has seen from 1, the present one, to {T}."
         )
+    if on_cpu and not ((window >= 0) & (window < W)).all():
+        raise UserError(f"The world model was given windows {window.tolist()} of {W}: they are numbered from 0.")
     return observations, actions, lengths, window
+
+
+def _whole(name: str, numbers: Tensor | ArrayLike, device: torch.device) -> Tensor:
+    """Numbers of observations or of windows."""
+    try:
+        found = numbers if isinstance(numbers, Tensor) else torch.from_numpy(np.array(numbers)).to(device)
+    except (TypeError, ValueError):
+        found = None
+    if found is None or (found.is_floating_point() and found.numel() > 0):
+        raise UserError(f"The world model was given {name} {numbers}: give whole numbers, one for each rollout.")
+    return found.long()
