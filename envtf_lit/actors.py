@@ -41,13 +41,10 @@ def in_fp32(layer: nn.Module, x: Tensor) -> Tensor:
 def in_kind(
     act: Callable[[Tensor], Tensor], observation: Tensor | ArrayLike, device: torch.device
 ) -> Tensor | np.ndarray:
-    """Actions for what was seen: a tensor for a tensor, float64 for float64 and else float32; an array (float32) for an
-    array or lists.
+    """Actions of `act`, which takes tensors in single precision or less, for what was seen, and in its kind.
 
-    Args:
-        act: of tensors in single precision or less.
-        observation: what was seen.
-        device: where arrays and lists are looked at.
+    A tensor for a tensor, float64 for float64 and else float32; for an array or lists, which are looked at on `device`,
+    an array (float32).
     """
     if not isinstance(observation, Tensor):
         return act(torch.from_numpy(np.array(observation, np.float32)).to(device)).cpu().numpy()
@@ -186,8 +183,8 @@ class Actor(nn.Module, ABC):
             UserError: it is not as wide as the actor's observations.
         """
         with torch.no_grad():
-            act = lambda given: self._act(given, deterministic, generator)  # noqa: E731
-            return in_kind(act, observation, self.observation_mean.device)
+            device = self.observation_mean.device
+            return in_kind(lambda given: self._act(given, deterministic, generator), observation, device)
 
     @abstractmethod
     def _act(self, observation: Tensor, deterministic: bool, generator: torch.Generator | None) -> Tensor:
